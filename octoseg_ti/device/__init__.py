@@ -1,0 +1,1 @@
+"""Everything that knows Taichi but nothing of scans."""

@@ -1,0 +1,141 @@
+"""Every option of the segmentation, declared once: meaning, unit, default.
+
+A value of None means "derive it from the data"; the result holds the parameters with every None
+filled in. The command line, its help, the saved configuration and the documentation come from here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CleaningParams:
+    """Marking of spikes and isolated points (I3)."""
+
+    enabled: bool = True
+    """Mark spikes and isolated points before normals are estimated."""
+    spike: float | None = None
+    """Smallest distance of a spike from the line through its neighbours [mm]; default: from noise
+    and spacing."""
+    isolation: float | None = None
+    """Largest gap that a point may have to all its neighbours [mm]; default: from the spacing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NormalParams:
+    """Point normals from edge pairs of neighbouring stripes (N1-N9)."""
+
+    rule: Literal["diagonal", "paper"] = "diagonal"
+    """Next point of the march: the shorter diagonal, or literally the candidate nearest the origin."""
+    gap: float | None = None
+    """Longest edge of a triangle [mm]; longer ones break the strip. Default: from the spacing."""
+    weight: Literal["unit", "area"] = "unit"
+    """Mean of unit normals (Eq. 1), or weighted by the area of the triangles."""
+    neighbors: int = 12
+    """Neighbours of a point when the input has no stripes (I8)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GridParams:
+    """The sparse octree of normals (G1-G8)."""
+
+    divisions: int | None = None
+    """Cells along the shortest side of the bounding box; default: the cell is a power of two
+    times the smallest cell."""
+    tolerance: float | None = None
+    """Largest deviation of the normals in a cell (Eq. 4), 0..1; default: from the noise of the normals."""
+    min_cell: float | None = None
+    """Smallest cell [mm]; default: from the spacing. 0 = no limit."""
+    min_points: int = 3
+    """A cell with fewer points is not split."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EdgeParams:
+    """Which cells are edges (S1-S3)."""
+
+    rule: Literal["reason", "levels", "radius"] = "reason"
+    """By why a cell stopped, by its level (paper), or by the radius that its size stands for."""
+    smallest_levels: int = 4
+    """Rule "levels": how many of the smallest cell sizes are edges."""
+    fillet_levels: int = 0
+    """Rule "levels": how many of these sizes, from the largest down, are fillets."""
+    radius: float = 1.0
+    """Rule "radius": smallest radius that is still a patch [mm]; s = sqrt(12) tolerance radius."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegionParams:
+    """Flood fill over touching cells (S4-S7), and what happens to the points left over."""
+
+    homogeneity: float | None = None
+    """Largest angle between the mean normals of touching cells [rad]; default: from the tolerance."""
+    min_points: int | None = None
+    """A group with fewer points is no patch; default: from the smallest cell and the spacing."""
+    assign_edges: bool = True
+    """Give edge points to the neighbouring patch that they fit."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Params:
+    """All parameters of `segment`."""
+
+    cleaning: CleaningParams = field(default_factory=CleaningParams)
+    normals: NormalParams = field(default_factory=NormalParams)
+    grid: GridParams = field(default_factory=GridParams)
+    edges: EdgeParams = field(default_factory=EdgeParams)
+    regions: RegionParams = field(default_factory=RegionParams)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return nested plain values, for JSON."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Params:
+        """Build parameters from nested plain values.
+
+        Raises:
+            ValueError: A key is unknown; the message names it.
+        """
+        sections = {f.name: f.default_factory for f in dataclasses.fields(cls)}
+        built = {}
+        for name, section in values.items():
+            if name not in sections:
+                raise ValueError(f"unknown parameter section {name!r}; known: {', '.join(sections)}")
+            known = {f.name for f in dataclasses.fields(type(sections[name]()))}  # type: ignore[misc]
+            for key in section:
+                if key not in known:
+                    raise ValueError(f"unknown parameter {name}.{key}; known: {', '.join(sorted(known))}")
+            built[name] = type(sections[name]())(**section)  # type: ignore[misc]
+        return cls(**built)
+
+
+def paper(
+    *, divisions: int = 12, tolerance: float = 0.01, smallest_levels: int = 4, fillet_levels: int = 0,
+    homogeneity: float = math.radians(20.0), min_points: int = 30,
+) -> Params:
+    """Return the parameters of the literal method of Woo et al. 2002, with its user values.
+
+    Args:
+        divisions: Cells along the shortest side of the bounding box (section 3.3).
+        tolerance: Largest deviation of the normals in a cell (Eq. 4).
+        smallest_levels: How many of the smallest cell sizes are edges (section 3.4).
+        fillet_levels: How many of these are fillets, counted from the largest.
+        homogeneity: Largest angle between the mean normals of merged cells [rad].
+        min_points: Smallest group that a surface can be fitted to.
+    """
+    return Params(
+        cleaning=CleaningParams(enabled=False),
+        normals=NormalParams(rule="paper"),
+        grid=GridParams(divisions=divisions, tolerance=tolerance, min_cell=0.0, min_points=2),
+        edges=EdgeParams(rule="levels", smallest_levels=smallest_levels, fillet_levels=fillet_levels),
+        regions=RegionParams(homogeneity=homogeneity, min_points=min_points, assign_edges=False),
+    )
+
+
+PRESETS = {"default": Params, "paper": paper}
+"""Named parameter sets."""

@@ -1,0 +1,257 @@
+"""What flows between the parts of octoseg: frozen groups of arrays, and the closed sets of codes.
+
+Lengths are millimetres, angles radians, normals unit length and pointing to the probe. ``N`` is the
+number of points, ``V`` of views, ``S`` of stripes, ``C`` of cells, ``K`` of patches.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from octoseg_ti.params import Params
+
+NONE = -1
+"""The label of a point that belongs to no patch."""
+
+
+class SurfaceKind(IntEnum):
+    """Kind of the analytic surface of a patch."""
+
+    NONE = -1
+    """Not determined."""
+    PLANE = 0
+    CYLINDER = 1
+    CONE = 2
+    SPHERE = 3
+    TORUS = 4
+    FREE_FORM = 5
+
+
+class EdgeClass(IntEnum):
+    """Why a point counts as an edge point."""
+
+    NONE = 0
+    SHARP = 1
+    FILLET = 2
+    SMOOTH = 3
+    """A joint where the normal is continuous and the curvature is not."""
+
+
+class StopReason(IntEnum):
+    """Why a cell was not split further."""
+
+    HOMOGENEOUS = 0
+    """The deviation of its normals is within the tolerance."""
+    MIN_SIZE = 1
+    """Its daughters would be smaller than the smallest cell."""
+    FEW_POINTS = 2
+    """It holds too few points to be split."""
+    MAX_LEVEL = 3
+    """The deepest level that a key can address was reached."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scans:
+    """Points of one or several views, in the order in which the scanner delivered them.
+
+    Points of a stripe are stored one after the other, in order along the stripe; stripes are stored
+    in scan order. Without ``stripe`` the points are unorganised.
+    """
+
+    points: np.ndarray
+    """Positions [mm], shape (N, 3), f64, in the frame named by ``frame``."""
+    normals: np.ndarray | None = None
+    """Unit normals, shape (N, 3), f64, same frame; None when they are still to be estimated."""
+    stripe: np.ndarray | None = None
+    """Stripe number of every point, shape (N,), i32, non-decreasing within a view. Numbers are
+    unique over all views; a number may be missing (a lost line)."""
+    column: np.ndarray | None = None
+    """Position along the stripe (detector row), shape (N,), i32: gaps show missing samples."""
+    view: np.ndarray | None = None
+    """View number of every point, shape (N,), i32; None means one view."""
+    time_ns: np.ndarray | None = None
+    """Time of every point since the start of the recording [ns], shape (N,), i64."""
+    T_world_view: np.ndarray | None = None
+    """Pose of every view: maps view to world, shape (V, 4, 4), f64."""
+    origin: np.ndarray | None = None
+    """A probe position of every view [mm], world frame, shape (V, 3), f64: tells the outer side."""
+    stripe_origin: np.ndarray | None = None
+    """Probe position at every stripe [mm], world frame, shape (S, 3), S = largest stripe + 1."""
+    frame: str = "world"
+    """Frame of ``points`` and ``normals``: "world", or "view" (then ``T_world_view`` is given)."""
+    name: str = ""
+    """Where the scans come from, for reports."""
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.points)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Truth:
+    """What is known for sure about every point, from the simulator or from labelled data.
+
+    Only ``patch`` is always there.
+    """
+
+    patch: np.ndarray
+    """Patch of every point, shape (N,), i32, 0..K-1 by size; -1 = no patch (a fillet strip, an
+    artefact, not labelled). A patch is a connected visible piece of one surface."""
+    surface: np.ndarray | None = None
+    """Surface (face of the construction) of every point, shape (N,), i32."""
+    kind: np.ndarray | None = None
+    """`SurfaceKind` of every point's surface, shape (N,), i8."""
+    position: np.ndarray | None = None
+    """True position [mm], world frame, shape (N, 3), f64."""
+    normal: np.ndarray | None = None
+    """True unit normal, world frame, shape (N, 3), f64."""
+    edge_distance: np.ndarray | None = None
+    """Distance to the nearest true edge [mm], shape (N,), f32; 0 on a fillet strip."""
+    edge_class: np.ndarray | None = None
+    """`EdgeClass` of that nearest edge, shape (N,), u8."""
+    info: dict[str, str] = field(default_factory=dict)
+    """How the truth came about: part, seed, noise."""
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.patch)
+
+    @property
+    def patch_count(self) -> int:
+        """Number of true patches."""
+        return int(self.patch.max(initial=NONE)) + 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Cells:
+    """The leaves of the sparse grid, in Morton order."""
+
+    corner: np.ndarray
+    """Lower corner [mm], world frame, shape (C, 3), f64."""
+    size: np.ndarray
+    """Edge length [mm], shape (C,), f64."""
+    level: np.ndarray
+    """Level, 0 = initial cell, shape (C,), i8."""
+    count: np.ndarray
+    """Points in the cell, shape (C,), i32."""
+    normal: np.ndarray
+    """Normalised mean normal, shape (C, 3), f32."""
+    sigma: np.ndarray
+    """Deviation of the normals (Eq. 4), shape (C,), f32."""
+    stop: np.ndarray
+    """`StopReason`, shape (C,), u8."""
+    edge: np.ndarray
+    """`EdgeClass` of the cell, shape (C,), u8."""
+    label: np.ndarray
+    """Patch of the cell after the flood fill, shape (C,), i32; -1 = none."""
+    initial_size: float
+    """Edge length of the initial cells [mm]."""
+
+    def __len__(self) -> int:
+        """Return the number of cells."""
+        return len(self.size)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measurement:
+    """What was measured on the data, and what the default derived from it."""
+
+    spacing_along: float
+    """Median distance of neighbours on a stripe [mm] (unorganised: nearest neighbours)."""
+    spacing_across: float
+    """Median distance between neighbouring stripes [mm] (unorganised: as along)."""
+    noise: float
+    """Estimated standard deviation of the range noise [mm]."""
+    normal_noise: float
+    """Estimated deviation of a point normal from the surface normal [rad]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Segmentation:
+    """The answer of `segment`, in the order of the input points."""
+
+    points: np.ndarray
+    """Positions [mm], world frame, shape (N, 3), f64."""
+    normals: np.ndarray
+    """Unit normals pointing to the probe, world frame, shape (N, 3), f32; 0 where there is none."""
+    labels: np.ndarray
+    """Patch of every point, 0..K-1 by size, shape (N,), i32; -1 = none."""
+    edge: np.ndarray
+    """`EdgeClass` of every point, shape (N,), u8."""
+    level: np.ndarray
+    """Level of the cell that holds the point, shape (N,), i8; -1 = in no cell."""
+    outlier: np.ndarray
+    """1 where cleaning marked the point, shape (N,), u8."""
+    kind: np.ndarray
+    """`SurfaceKind` of every patch, shape (K,), i8."""
+    surface: np.ndarray
+    """Surface of every patch, shape (K,), i32: patches of one surface share a number."""
+    parameters: np.ndarray
+    """Surface parameters of every patch, shape (K, 8), f64: point (3), axis or normal (3), a, b;
+    a = radius (cylinder, sphere, torus ring), half angle (cone); b = tube radius (torus). NaN = none."""
+    residual: np.ndarray
+    """Root mean square distance of the points to the fitted surface [mm], shape (K,); NaN = none."""
+    cells: Cells
+    """The final grid."""
+    stripe: np.ndarray | None = None
+    """Stripe numbers of the input, shape (N,), i32."""
+    view: np.ndarray | None = None
+    """View numbers of the input, shape (N,), i32."""
+    params: Params
+    """The parameters, with every value that was left open filled in."""
+    measured: Measurement
+    """What was measured on the data."""
+    passes: int
+    """Subdivision passes that split a cell, plus one for the initial grid."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Wall time of every stage [s], in order."""
+    name: str = ""
+    """Where the scans came from."""
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.labels)
+
+    @property
+    def patch_count(self) -> int:
+        """Number of patches."""
+        return len(self.kind)
+
+    @property
+    def patch_sizes(self) -> np.ndarray:
+        """Points of every patch, shape (K,), i64."""
+        return np.bincount(self.labels[self.labels >= 0], minlength=self.patch_count)
+
+    @property
+    def level_count(self) -> int:
+        """Number of distinct cell sizes."""
+        return len(np.unique(self.cells.level))
+
+    def __str__(self) -> str:
+        """Say in a few lines what was found, and how."""
+        labelled = float(np.mean(self.labels >= 0)) if len(self) else 0.0
+        lines = [
+            f"Segmentation: {len(self)} points, {self.patch_count} patches, "
+            f"{labelled:.1%} labelled, {int(np.count_nonzero(self.edge))} edge points, "
+            f"{int(self.outlier.sum())} outliers",
+            f"  {len(self.cells)} cells in {self.level_count} sizes, "
+            f"tolerance {self.params.grid.tolerance:.3g}, "
+            f"normal noise {self.measured.normal_noise:.3g} rad, "
+            f"spacing {self.measured.spacing_along:.3g} / {self.measured.spacing_across:.3g} mm",
+        ]
+        sizes = self.patch_sizes
+        for k in range(min(self.patch_count, 12)):
+            kind = SurfaceKind(int(self.kind[k])).name.lower().replace("_", "-")
+            rms = "" if np.isnan(self.residual[k]) else f", rms {self.residual[k]:.4f} mm"
+            lines.append(f"  patch {k}: {kind}, {sizes[k]} points{rms}")
+        if self.patch_count > 12:
+            lines.append(f"  ... and {self.patch_count - 12} smaller ones")
+        if self.seconds:
+            stages = ", ".join(f"{name} {1e3 * s:.1f}" for name, s in self.seconds.items())
+            lines.append(f"  milliseconds: {stages}")
+        return "\n".join(lines)

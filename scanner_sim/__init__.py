@@ -1,0 +1,1 @@
+"""A stripe laser scanner that knows the truth."""
