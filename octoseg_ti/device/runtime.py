@@ -161,6 +161,18 @@ def zeros(shape: int | tuple[int, ...], dtype: type) -> Any:
     return ti.ndarray(_TAICHI_DTYPE[np.dtype(dtype).name], tuple(max(s, 1) for s in shape))
 
 
+def grown(array: Any, rows: int) -> Any:
+    """Return a copy with more rows; the values of the new ones are undefined."""
+    larger = empty((rows, *array.shape[1:]), download(array[:0] if on_cpu() else array).dtype.type)
+    if on_cpu():
+        larger[: array.shape[0]] = array
+    else:
+        host = np.zeros(tuple(larger.shape), download(array).dtype)
+        host[: array.shape[0]] = download(array)
+        larger.from_numpy(host)
+    return larger
+
+
 def download(array: Any) -> np.ndarray:
     """Return a kernel array as NumPy: itself on the CPU, a copy elsewhere."""
     return array if isinstance(array, np.ndarray) else array.to_numpy()

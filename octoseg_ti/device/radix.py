@@ -1,0 +1,123 @@
+"""Stable least-significant-digit radix sort of integer keys, and prefix sums of counts.
+
+A pass is: count the digits of every chunk, scan the counts digit by digit over the chunks, move
+every element to its place. The order of equal keys is kept, so the result does not depend on the
+number of threads.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.device.runtime import I32Array, I32Rows, I64Array, ti
+
+_MOST_DIGIT_BITS = 12
+
+
+@ti.kernel
+def _count_digits(
+    n: ti.i32,
+    workers: ti.i32,
+    stride: ti.i32,
+    shift: ti.i32,
+    radix: ti.i32,
+    # In:
+    key_in: I64Array,
+    # Out:
+    count_out: I32Rows,
+):
+    """Count, for every chunk of keys, how often each digit occurs."""
+    chunk = (n + workers - 1) // workers
+    for u in range(workers * stride):
+        if u % stride == 0:
+            w = u // stride
+            for d in range(radix):
+                count_out[w, d] = 0
+            for i in range(w * chunk, ti.min(n, (w + 1) * chunk)):
+                d = ti.cast((key_in[i] >> shift) & (radix - 1), ti.i32)
+                count_out[w, d] = count_out[w, d] + 1
+
+
+@ti.kernel
+def _scan_digits(
+    workers: ti.i32,
+    radix: ti.i32,
+    # Out:
+    count_inout: I32Rows,
+):
+    """Replace the counts by first places: ordered by digit, then by chunk."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        total = 0
+        for d in range(radix):
+            for w in range(workers):
+                here = count_inout[w, d]
+                count_inout[w, d] = total
+                total = total + here
+
+
+@ti.kernel
+def _move(
+    n: ti.i32,
+    workers: ti.i32,
+    stride: ti.i32,
+    shift: ti.i32,
+    radix: ti.i32,
+    # In:
+    key_in: I64Array,
+    index_in: I32Array,
+    # Out:
+    place_inout: I32Rows,
+    key_out: I64Array,
+    index_out: I32Array,
+):
+    """Move every element to the place of its digit, in order within a chunk."""
+    chunk = (n + workers - 1) // workers
+    for u in range(workers * stride):
+        if u % stride == 0:
+            w = u // stride
+            for i in range(w * chunk, ti.min(n, (w + 1) * chunk)):
+                key = key_in[i]
+                d = ti.cast((key >> shift) & (radix - 1), ti.i32)
+                place = place_inout[w, d]
+                place_inout[w, d] = place + 1
+                key_out[place] = key
+                index_out[place] = index_in[i]
+
+
+def sort_pairs(key: Any, index: Any, bits: int) -> tuple[Any, Any]:
+    """Sort keys, and an index with them, by the lowest bits; equal keys keep their order.
+
+    Args:
+        key: Non-negative keys, shape (n,), i64, a kernel array. Used as scratch.
+        index: What travels with the keys, shape (n,), i32, a kernel array. Used as scratch.
+        bits: Number of low bits that can differ, 1..63.
+
+    Returns:
+        The sorted keys and the index in that order, kernel arrays.
+
+    Raises:
+        ValueError: ``bits`` is out of range, or the shapes differ.
+    """
+    runtime.ensure_started()
+    n = key.shape[0]
+    if not 1 <= bits <= 63:
+        raise ValueError(f"bits must be 1..63, not {bits}")
+    if index.shape[0] != n:
+        raise ValueError(f"key and index differ in length: {n} and {index.shape[0]}")
+    if n == 0:
+        return key, index
+    passes = -(-bits // _MOST_DIGIT_BITS)
+    digit_bits = -(-bits // passes)
+    workers, stride = runtime.workers()
+    count = runtime.empty((workers, 1 << digit_bits), np.int32)
+    other_key, other_index = runtime.empty(n, np.int64), runtime.empty(n, np.int32)
+    for p in range(passes):
+        shift, radix = p * digit_bits, 1 << digit_bits
+        _count_digits(n, workers, stride, shift, radix, key, count)
+        _scan_digits(workers, radix, count)
+        _move(n, workers, stride, shift, radix, key, index, count, other_key, other_index)
+        key, other_key = other_key, key
+        index, other_index = other_index, index
+    return key, index

@@ -1,0 +1,191 @@
+"""What the data say about themselves: spacing along and across the stripes, noise of points and normals.
+
+The default parameters are derived from these figures, so they must not depend on the order of the
+views: every figure is a median or a trimmed mean over points chosen by their place in the stripe.
+"""
+
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.device.linalg import row, vec3
+from octoseg_ti.device.runtime import F32Array, F64Rows, I32Array, ti
+
+_SAMPLES = 100_000
+# Mean of the lower three quarters of |x| for x normal, and of a Rayleigh variable, both of unit scale.
+# Trimmed means instead of medians: coarse quantisation can make a median zero.
+_TRIM = 0.75
+_HALF_NORMAL_TRIMMED = 0.5149
+_RAYLEIGH_TRIMMED = 0.9558
+_LAG = 3
+
+
+@ti.kernel
+def _measure_spacing(
+    step: ti.i32,
+    runs: ti.i32,
+    # In:
+    point_in: F64Rows,
+    start_in: I32Array,
+    view_in: I32Array,
+    run_in: I32Array,
+    # Out:
+    along_out: F32Array,
+    across_out: F32Array,
+):
+    """Write the distance to the next point of the stripe, and to the nearest one of the next stripe."""
+    for i in run_in:
+        along_out[i] = -1.0
+        across_out[i] = -1.0
+        run = run_in[i]
+        lo = start_in[run]
+        hi = start_in[run + 1]
+        if (i - lo) % step == 0:
+            p = row(point_in, i)
+            if i + 1 < hi:
+                along_out[i] = ti.cast((row(point_in, i + 1) - p).norm(), ti.f32)
+            if run + 1 < runs and view_in[start_in[ti.min(run + 1, runs - 1)]] == view_in[lo]:
+                # A guess by proportion, then downhill to the nearest point.
+                first = hi
+                last = start_in[run + 2] - 1
+                j = first + ti.cast((last - first) * ((i - lo) / ti.max(1, hi - lo - 1)), ti.i32)
+                best = (row(point_in, j) - p).norm()
+                moving = 1
+                while moving == 1:
+                    moving = 0
+                    for side in ti.static((-1, 1)):
+                        k = j + side
+                        if k >= first and k <= last:
+                            d = (row(point_in, k) - p).norm()
+                            if d < best:
+                                best = d
+                                j = k
+                                moving = 1
+                across_out[i] = ti.cast(best, ti.f32)
+
+
+@ti.kernel
+def _measure_noise(
+    step: ti.i32,
+    lag: ti.i32,
+    gap: ti.f64,
+    # In:
+    point_in: F64Rows,
+    normal_in: F64Rows,
+    start_in: I32Array,
+    run_in: I32Array,
+    # Out:
+    range_out: F32Array,
+    tilt_out: F32Array,
+):
+    """Write second differences along the stripe: of the range with lag 1, of the normal with a lag.
+
+    With a lag of 3 the three normals share no triangle, so their errors are independent.
+    """
+    for i in run_in:
+        range_out[i] = -1.0
+        tilt_out[i] = -1.0
+        lo = start_in[run_in[i]]
+        hi = start_in[run_in[i] + 1]
+        normal = row(normal_in, i)
+        if (i - lo) % step == 0 and normal.norm() > 0.5:
+            p = row(point_in, i)
+            if i - 1 >= lo and i + 1 < hi:
+                before = row(point_in, i - 1) - p
+                after = row(point_in, i + 1) - p
+                if before.norm() <= gap and after.norm() <= gap:
+                    range_out[i] = ti.cast(ti.abs((before + after).dot(normal)), ti.f32)
+            if i - lag >= lo and i + lag < hi:
+                a = row(normal_in, i - lag)
+                b = row(normal_in, i + lag)
+                near = (row(point_in, i - lag) - row(point_in, i + lag)).norm()
+                if a.norm() > 0.5 and b.norm() > 0.5 and near <= 2 * lag * gap:
+                    tilt_out[i] = ti.cast((normal - 0.5 * (a + b)).norm(), ti.f32)
+
+
+def _step(n: int) -> int:
+    """Return the stride along a stripe that keeps about `_SAMPLES` points."""
+    return max(1, n // _SAMPLES)
+
+
+def _trimmed_mean(values: np.ndarray) -> float:
+    """Return the mean of the lower three quarters of the non-negative values; 0 if there are none."""
+    values = values[values >= 0]
+    if len(values) == 0:
+        return 0.0
+    keep = max(1, int(_TRIM * len(values)))
+    # Sorted, so that the sum does not depend on the order of the views.
+    return float(np.mean(np.sort(values)[:keep], dtype=np.float64))
+
+
+def _median(values: np.ndarray) -> float:
+    """Return the median of the non-negative values; 0 if there are none."""
+    values = values[values >= 0]
+    return float(np.median(values)) if len(values) else 0.0
+
+
+def stripe_spacing(
+    points: np.ndarray, start: np.ndarray, run: np.ndarray, view: np.ndarray
+) -> tuple[float, float]:
+    """Return the median spacing along and across the stripes [mm].
+
+    Args:
+        points: Positions [mm], shape (N, 3), f64, in stripe order.
+        start: First point of every stripe, and N at the end, shape (S + 1,), i32.
+        run: Index of the stripe of every point, shape (N,), i32.
+        view: View of every point, shape (N,), i32.
+
+    Returns:
+        Spacing along and across; 0 where nothing could be measured.
+    """
+    runtime.ensure_started()
+    n = len(points)
+    along, across = runtime.empty(n, np.float32), runtime.empty(n, np.float32)
+    _measure_spacing(
+        _step(n),
+        len(start) - 1,
+        runtime.upload(points),
+        runtime.upload(start),
+        runtime.upload(view),
+        runtime.upload(run),
+        along,
+        across,
+    )
+    return _median(runtime.download(along)), _median(runtime.download(across))
+
+
+def stripe_noise(
+    points: np.ndarray, normals: np.ndarray, start: np.ndarray, run: np.ndarray, gap: float
+) -> tuple[float, float]:
+    """Return the noise of the range [mm] and of the normals [rad], measured along the stripes.
+
+    Second differences remove position, slope and constant curvature; what remains is noise. The mean
+    of the lower three quarters ignores edges.
+
+    Args:
+        points: Positions [mm], shape (N, 3), f64, in stripe order.
+        normals: Unit normals, shape (N, 3), f64; zero rows have none.
+        start: First point of every stripe, and N at the end, shape (S + 1,), i32.
+        run: Index of the stripe of every point, shape (N,), i32.
+        gap: Longest distance between neighbours [mm].
+
+    Returns:
+        Standard deviation of the range, and root mean square deviation of the normals.
+    """
+    runtime.ensure_started()
+    n = len(points)
+    second, tilt = runtime.empty(n, np.float32), runtime.empty(n, np.float32)
+    _measure_noise(
+        _step(n),
+        _LAG,
+        gap,
+        runtime.upload(points),
+        runtime.upload(normals),
+        runtime.upload(start),
+        runtime.upload(run),
+        second,
+        tilt,
+    )
+    noise = _trimmed_mean(runtime.download(second)) / _HALF_NORMAL_TRIMMED / np.sqrt(6.0)
+    # Two components of the tilt, each with 1 + 1/4 + 1/4 of the variance of one normal.
+    component = _trimmed_mean(runtime.download(tilt)) / _RAYLEIGH_TRIMMED / np.sqrt(1.5)
+    return float(noise), float(component * np.sqrt(2.0))

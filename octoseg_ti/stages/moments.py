@@ -1,0 +1,151 @@
+"""Moments of cells (Eqs 3 and 4): sums that tell mean, deviation and flatness without the points.
+
+A cell has 19 moments, in units of 2^-30: the count; sum N; sum N N'; sum p; sum p p', with p measured
+from the middle of the cell in half cell sizes. They are integers, so a sum depends neither on the
+order of the points nor on the threads.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.device.linalg import row, symmetric_eigen, vec3
+from octoseg_ti.device.runtime import F64Rows, I32Rows, I64Rows, ti
+
+COUNT = 19
+_ONE = 1073741824.0  # 2^30: a sum of 2^33 values still fits 64 bits
+_SLICE = 256
+
+# Columns of the integer table of the cells ...
+LO, HI, LEVEL, X, Y, Z, STOP, EDGE = range(8)
+# ... and of the real one: normalised mean normal (3), mean point (3), deviation, residual.
+NORMAL, POINT, SIGMA, RESIDUAL = 0, 3, 6, 7
+
+
+@ti.func
+def _fixed(x: ti.f64) -> ti.i64:
+    """Return a value of -1..1 in fixed point."""
+    return ti.cast(ti.round(x * _ONE), ti.i64)
+
+
+@ti.kernel
+def _accumulate(
+    first: ti.i32,
+    last: ti.i32,
+    slices: ti.i32,
+    size: ti.f64,
+    # In:
+    node_in: I32Rows,
+    point_in: F64Rows,
+    normal_in: F64Rows,
+    # Out:
+    moment_inout: I64Rows,
+):
+    """Add up the moments of the nodes first..last-1, one level, in slices of the sorted points."""
+    for u in range(slices):
+        i = u * _SLICE
+        end = ti.min(i + _SLICE, point_in.shape[0])
+        c = first  # the first node of the level that ends after i
+        high = last
+        while c < high:
+            middle = (c + high) // 2
+            if node_in[middle, HI] > i:
+                high = middle
+            else:
+                c = middle + 1
+        while c < last and i < end:
+            i = ti.max(i, node_in[c, LO])
+            stop = ti.min(end, node_in[c, HI])
+            middle = size * (vec3(node_in[c, X], node_in[c, Y], node_in[c, Z]) + 0.5)
+            if i < stop:
+                sums = ti.Vector([ti.i64(0)] * COUNT)
+                sums[0] = ti.cast(stop - i, ti.i64)
+                while i < stop:
+                    n = row(normal_in, i)
+                    p = (row(point_in, i) - middle) * (2.0 / size)
+                    for k in ti.static(range(3)):
+                        sums[1 + k] += _fixed(n[k])
+                        sums[10 + k] += _fixed(p[k])
+                    for k in ti.static(range(6)):
+                        a, b = ti.static((0, 0, 0, 1, 1, 2)[k]), ti.static((0, 1, 2, 1, 2, 2)[k])
+                        sums[4 + k] += _fixed(n[a] * n[b])
+                        sums[13 + k] += _fixed(p[a] * p[b])
+                    i += 1
+                for k in ti.static(range(COUNT)):
+                    ti.atomic_add(moment_inout[c - first, k], sums[k])
+            c += 1
+
+
+@ti.func
+def _moments(moment: ti.template(), c: ti.i32, first: ti.i32, scale: ti.f64) -> vec3:
+    """Return three sums of a cell as means."""
+    return scale * vec3(moment[c, first], moment[c, first + 1], moment[c, first + 2])
+
+
+@ti.kernel
+def _describe(
+    first: ti.i32,
+    last: ti.i32,
+    signed: ti.i32,
+    size: ti.f64,
+    # In:
+    node_in: I32Rows,
+    moment_in: I64Rows,
+    # Out:
+    mean_out: F64Rows,
+):
+    """Write mean normal, mean point, deviation (Eq. 4) and residual of the nodes of a level."""
+    for c in range(first, last):
+        m = c - first
+        scale = 1.0 / (_ONE * ti.cast(moment_in[m, 0], ti.f64))
+        # Eq. 4 for unit normals: sigma^2 = 1 - |mean|^2. Points without a normal are no part of it.
+        nn = _moments(moment_in, m, 4, scale)
+        nm = _moments(moment_in, m, 7, scale)
+        present = ti.max(nn[0] + nm[0] + nm[2], 1e-12)
+        normal = _moments(moment_in, m, 1, scale)
+        variance = 1.0 - normal.norm_sqr() / (present * present)
+        if signed == 0:
+            # The mean axis, and the spread around it: the normals may point either way.
+            values, _, _, axis = symmetric_eigen(nn[0], nn[1], nn[2], nm[0], nm[1], nm[2])
+            normal = axis
+            variance = 1.0 - values[2] / present
+        length = normal.norm()
+        if length > 0.0:
+            normal = normal / length
+        p = _moments(moment_in, m, 10, scale)
+        pp = _moments(moment_in, m, 13, scale)
+        pm = _moments(moment_in, m, 16, scale)
+        cov = vec3(
+            (pp[0] - p[0] * p[0]) * normal[0] + 2.0 * (pp[1] - p[0] * p[1]) * normal[1],
+            (pm[0] - p[1] * p[1]) * normal[1] + 2.0 * (pm[1] - p[1] * p[2]) * normal[2],
+            (pm[2] - p[2] * p[2]) * normal[2] + 2.0 * (pp[2] - p[0] * p[2]) * normal[0],
+        )
+        middle = size * (vec3(node_in[c, X], node_in[c, Y], node_in[c, Z]) + 0.5)
+        for k in ti.static(range(3)):
+            mean_out[c, NORMAL + k] = normal[k]
+            mean_out[c, POINT + k] = middle[k] + 0.5 * size * p[k]
+        mean_out[c, SIGMA] = ti.sqrt(ti.max(0.0, variance))
+        mean_out[c, RESIDUAL] = 0.5 * size * ti.sqrt(ti.max(0.0, cov.dot(normal)))
+
+
+def describe_cells(
+    first: int, last: int, size: float, signed: bool, node: Any, point: Any, normal: Any, mean: Any
+) -> None:
+    """Write mean normal, mean point, deviation and residual of the cells of one level.
+
+    Args:
+        first: First cell of the level in the tables.
+        last: One past its last cell.
+        size: Edge length of its cells [mm].
+        signed: Normals have a side; else their axes are averaged.
+        node: Integer table of the cells, shape (M, 8), i32; ranges of the sorted points.
+        point: Sorted points, relative to the corner of the grid [mm], shape (n, 3), f64.
+        normal: Sorted unit normals, shape (n, 3), f64; a zero row counts as none.
+        mean: Real table of the cells, shape (M, 8), f64: the rows first..last-1 are written.
+    """
+    runtime.ensure_started()
+    moment = runtime.zeros((last - first, COUNT), np.int64)
+    slices = -(-point.shape[0] // _SLICE)
+    _accumulate(first, last, slices, size, node, point, normal, moment)
+    _describe(first, last, int(signed), size, node, moment, mean)

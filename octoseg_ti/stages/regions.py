@@ -1,0 +1,156 @@
+"""Stage 6: flood fill over touching cells whose mean normals agree (section 3.4).
+
+The homogeneity test is symmetric, so growing from seeds gives the connected components of the
+graph of cells. They are found with union-find, in parallel and independent of any order.
+"""
+
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.device.linalg import row, vec3
+from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
+from octoseg_ti.device.unionfind import unite
+from octoseg_ti.stages.grid import Grid, find_node
+from octoseg_ti.stages.moments import LEVEL, POINT, X, Y, Z
+from octoseg_ti.types import NONE
+
+
+@ti.func
+def _agree(
+    a: ti.i32,
+    b: ti.i32,
+    signed: ti.i32,
+    mean: ti.template(),
+    cosine: ti.f64,
+    chord: ti.f64,
+    slack: ti.f64,
+) -> ti.i32:
+    """Say whether two cells belong together: normals within the angle, chord along the surface."""
+    na = row(mean, a)
+    nb = row(mean, b)
+    if signed == 0 and na.dot(nb) < 0.0:
+        nb = -nb
+    between = vec3(
+        mean[b, POINT] - mean[a, POINT],
+        mean[b, POINT + 1] - mean[a, POINT + 1],
+        mean[b, POINT + 2] - mean[a, POINT + 2],
+    )
+    # On a smooth surface the chord is perpendicular to the mean of the two normals, whatever the
+    # curvature; across a step it is not.
+    lift = 0.5 * ti.abs(between.dot(na + nb))
+    return ti.cast(na.dot(nb) >= cosine and lift <= chord * between.norm() + slack, ti.i32)
+
+
+@ti.kernel
+def _flood(
+    cosine: ti.f64,
+    chord: ti.f64,
+    slack: ti.f64,
+    signed: ti.i32,
+    depth: ti.i32,
+    shape: ti.types.vector(3, ti.i32),
+    # In:
+    node_in: I32Rows,
+    child_in: I32Rows,
+    root_in: I32Array,
+    mean_in: F64Rows,
+    # Out:
+    parent_inout: I32Array,
+):
+    """Unite every leaf with the touching leaves of its own size or larger that agree with it."""
+    for c in parent_inout:
+        if parent_inout[c] >= 0:
+            level = node_in[c, LEVEL]
+            for o in range(27):
+                x = node_in[c, X] + o // 9 - 1
+                y = node_in[c, Y] + (o // 3) % 3 - 1
+                z = node_in[c, Z] + o % 3 - 1
+                b = find_node(x, y, z, level, shape, depth, root_in, child_in)
+                # Nodes are numbered level by level: a smaller number is a coarser cell, or one of
+                # the same size. So every touching pair is looked at exactly once.
+                if b >= 0 and b < c and child_in[b, 0] == -2 and parent_inout[b] >= 0:
+                    if _agree(c, b, signed, mean_in, cosine, chord, slack) == 1:
+                        unite(parent_inout, c, b)
+
+
+@ti.kernel
+def _flatten(
+    # In:
+    parent_in: I32Array,
+    # Out:
+    group_out: I32Array,
+):
+    """Write the root of every cell."""
+    for c in parent_in:
+        group_out[c] = -1
+        if parent_in[c] >= 0:
+            x = c
+            while parent_in[x] != x:
+                x = parent_in[x]
+            group_out[c] = x
+
+
+def flood_fill(
+    grid: Grid,
+    leaf: np.ndarray,
+    *,
+    homogeneity: float,
+    chord: float = float("inf"),
+    slack: float = 0.0,
+) -> np.ndarray:
+    """Merge touching cells whose mean normals agree (S4-S7).
+
+    Cells touch when their closed boxes share a corner, an edge or a face, whatever their sizes.
+
+    Args:
+        grid: The sparse grid.
+        leaf: Which nodes take part (leaves that are no edge cells), shape (M,), bool.
+        homogeneity: Largest angle between the mean normals of merged cells [rad].
+        chord: Largest sine of the angle between the line through the mean points of two cells and
+            the surface; infinite = off (the paper).
+        slack: What the noise adds to that distance [mm].
+
+    Returns:
+        Group of every node, named by the first of its nodes, -1 for nodes that take no part;
+        shape (M,), i32.
+    """
+    runtime.ensure_started()
+    parent = np.where(leaf, np.arange(grid.count, dtype=np.int32), NONE).astype(np.int32)
+    device_parent = runtime.upload(parent)
+    _flood(
+        float(np.cos(homogeneity)),
+        min(chord, 1e300),
+        slack,
+        int(grid.signed),
+        grid.depth,
+        ti.Vector(grid.shape),
+        grid.node,
+        grid.child,
+        grid.root,
+        grid.mean,
+        device_parent,
+    )
+    group = runtime.empty(grid.count, np.int32)
+    _flatten(device_parent, group)
+    return runtime.download(group)
+
+
+def number_groups(group: np.ndarray, count: np.ndarray, min_points: int) -> np.ndarray:
+    """Number the groups by size, largest first; small groups get -1.
+
+    Args:
+        group: Group of every node, shape (M,), i32, -1 = none.
+        count: Points of every node, shape (M,), i32.
+        min_points: A group with fewer points is no patch.
+
+    Returns:
+        Label of every node, shape (M,), i32. Groups of equal size are ordered by their first node,
+        which depends on where they are, not on the order of the points.
+    """
+    inside = group >= 0
+    size = np.bincount(group[inside], weights=count[inside], minlength=len(group)).astype(np.int64)
+    kept = np.flatnonzero(size >= max(1, min_points))
+    kept = kept[np.argsort(-size[kept], kind="stable")]
+    name = np.full(len(group) + 1, NONE, np.int32)
+    name[kept] = np.arange(len(kept), dtype=np.int32)
+    return name[np.where(inside, group, len(group))]
