@@ -18,6 +18,7 @@ from octoseg_ti.evaluation.overlap import (
     overlap_table,
 )
 from octoseg_ti.evaluation.points import (
+    has_normal,
     normal_angles,
     point_spacing,
     score_edges,
@@ -91,11 +92,13 @@ def evaluate(
     table = overlap_table(patch, labels)
     inner = None if interior is None else (patch[interior], labels[interior])
     inner_table = None if inner is None else overlap_table(*inner)
-    angles = missing = None
+    normal_scores = normal_scores_interior = None
     if normals is not None and known.normal is not None:
         angles = normal_angles(normals, known.normal)
-        lengths = np.einsum("ij,ij->i", normals, normals)
-        missing = ~(np.isfinite(lengths) & (lengths > 1e-18))
+        missing = ~has_normal(normals)
+        normal_scores = score_normals(angles, missing)
+        if interior is not None:
+            normal_scores_interior = score_normals(angles[interior], missing[interior])
     edges, note = {}, ""
     if edge is None:
         note = "the result has no edge points"
@@ -112,12 +115,8 @@ def evaluate(
         regions_interior=(
             None if inner is None or inner_table is None else _regions(inner_table, *inner, overlap)
         ),
-        normals=None if angles is None else score_normals(angles, missing),
-        normals_interior=(
-            None
-            if angles is None or interior is None
-            else score_normals(angles[interior], missing[interior])
-        ),
+        normals=normal_scores,
+        normals_interior=normal_scores_interior,
         edges=edges,
         edges_note=note,
         table=table,

@@ -12,6 +12,13 @@ from octoseg_ti.types import EdgeClass, Truth
 _SAMPLE = 20_000
 
 
+def has_normal(normals: np.ndarray) -> np.ndarray:
+    """Say of every row of shape (N, 3) whether it is a finite vector other than zero."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        squared = np.einsum("ij,ij->i", normals, normals)
+    return np.isfinite(squared) & (squared > 0)
+
+
 def normal_angles(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Return the angle between unoriented normals [rad], 0 to pi/2, shape (N,).
 
@@ -31,10 +38,8 @@ def normal_angles(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
         )
         # atan2 stays exact at small angles, where arccos does not.
         angle = np.arctan2(cross, np.abs(ax * bx + ay * by + az * bz))
-        length = ax * ax + ay * ay + az * az
-        true_length = bx * bx + by * by + bz * bz
-    angle[~(np.isfinite(length) & (length > 1e-18))] = np.pi / 2
-    angle[~(np.isfinite(true_length) & (true_length > 1e-18))] = np.nan
+    angle[~has_normal(estimated)] = np.pi / 2
+    angle[~has_normal(true)] = np.nan
     return angle
 
 

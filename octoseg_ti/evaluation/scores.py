@@ -160,7 +160,9 @@ class Scores:
             out.append((text, _count(a, name), _count(b, name)))
         out.append(("mean IoU", _number(a, "mean_iou"), _number(b, "mean_iou")))
         out.append(("adjusted Rand index", _number(a, "ari"), _number(b, "ari")))
-        out.append(("  labelled points only", _number(a, "ari_labelled"), _number(b, "ari_labelled")))
+        out.append(
+            ("  labelled points only", _number(a, "ari_labelled"), _number(b, "ari_labelled"))
+        )
         out.append(("points labelled", _share(a, "labelled"), _share(b, "labelled")))
         if self.normals is not None:
             n, m = self.normals, self.normals_interior
@@ -175,7 +177,10 @@ class Scores:
         width = max(len(row[0]) for row in rows)
         lines = [f"{'':{width}}  {'all':>10}  {'interior':>10}"]
         lines += [f"{a:{width}}  {b:>10}  {c:>10}" for a, b, c in rows]
-        lines.append(f"regions match when they share {self.overlap:.0%} of both; interior: {self.interior_rule}")
+        lines.append(
+            f"regions match when they share {self.overlap:.0%} of both; "
+            f"interior: {self.interior_rule}"
+        )
         if self.edges:
             lines.append(f"{'edge points':{width}}  {'precision':>10}  {'recall':>10}  {'F1':>10}")
             for name, e in self.edges.items():

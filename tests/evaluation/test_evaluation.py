@@ -89,7 +89,9 @@ def test_an_ambiguous_region_keeps_the_instance_of_higher_overlap():
     assert five(blocks(85, 15), np.zeros(100, int)) == (0, 1, 0, 0, 0)
     # Here region 1 also covers 24 foreign points of 106: it no longer lies in patch 0 by 80 %.
     truth = np.concatenate([np.zeros(200, int), np.ones(400, int)])
-    labels = np.concatenate([np.zeros(180, int), np.ones(20, int), np.ones(6, int), np.full(394, 2)])
+    labels = np.concatenate(
+        [np.zeros(180, int), np.ones(20, int), np.ones(6, int), np.full(394, 2)]
+    )
     assert five(labels, truth) == (2, 0, 0, 0, 1)
 
 
