@@ -120,6 +120,11 @@ def ensure_started() -> Options:
     return _started if _started is not None else start()
 
 
+def running() -> Options | None:
+    """Return the options in force, or None while Taichi has not been started."""
+    return _started
+
+
 def on_cpu() -> bool:
     """Say whether kernels run on the CPU."""
     return ensure_started().arch == "cpu"
