@@ -10,7 +10,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.stages.grid import Grid, find_node
-from octoseg_ti.stages.moments import POINT
+from octoseg_ti.stages.moments import HI, LO, POINT
 
 _ROUNDS = 3
 

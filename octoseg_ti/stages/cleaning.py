@@ -9,10 +9,6 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, ti
 
-# A spike stands off from its neighbours by this many spacings: a corner point of a sharp edge
-# stands off by 0.7 at most.
-SPIKE_SPACINGS = 2.0
-ISOLATION_SPACINGS = 5.0
 
 
 @ti.func

@@ -11,8 +11,6 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, ti
 
-# A strip breaks where an edge is longer than this many spacings.
-GAP_SPACINGS = 3.0
 
 
 @ti.func

@@ -1,0 +1,165 @@
+"""From what the user gave to what the stages take: usable rows, whole stripes, views 0..V-1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from octoseg_ti.errors import DataError
+from octoseg_ti.types import Scans
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Arranged:
+    """The usable points, stripe after stripe."""
+
+    row: np.ndarray
+    """Row of the input that every point came from, shape (n,), i64."""
+    points: np.ndarray
+    """Positions [mm], shape (n, 3), f64."""
+    normals: np.ndarray | None
+    """Unit normals of the input, shape (n, 3), f64."""
+    view: np.ndarray
+    """View of every point, shape (n,), i32, 0..V-1."""
+    run: np.ndarray | None
+    """Index of the stripe of every point, shape (n,), i32; None for unorganised points."""
+    start: np.ndarray | None
+    """First point of every stripe, and n at the end, shape (S + 1,), i32."""
+
+
+def as_scans(
+    data: Scans | np.ndarray,
+    normals: np.ndarray | None = None,
+    stripe: np.ndarray | None = None,
+    view: np.ndarray | None = None,
+) -> Scans:
+    """Return the input as checked `Scans`.
+
+    Raises:
+        DataError: A shape is wrong, there is no point, a stripe or view number is negative, or the
+            poses are missing; the message names the array.
+    """
+    if isinstance(data, Scans):
+        if normals is not None or stripe is not None or view is not None:
+            raise DataError("give normals, stripe and view inside the scans, not beside them")
+        scans = data
+    else:
+        scans = Scans(points=data, normals=normals, stripe=stripe, view=view)
+    points = _rows("points", scans.points, None)
+    if len(points) == 0:
+        raise DataError("there are no points")
+    n = len(points)
+    checked = {
+        "points": points,
+        "normals": None if scans.normals is None else _rows("normals", scans.normals, n),
+        "stripe": _numbers("stripe", scans.stripe, n),
+        "view": _numbers("view", scans.view, n),
+    }
+    if scans.frame not in ("world", "view"):
+        raise DataError(f"frame must be 'world' or 'view', not {scans.frame!r}")
+    views = 1 if checked["view"] is None else int(checked["view"].max()) + 1
+    if scans.frame == "view" and scans.T_world_view is None:
+        raise DataError("points in the frame of their view need T_world_view")
+    for name, shape in (("T_world_view", (4, 4)), ("origin", (3,))):
+        value = getattr(scans, name)
+        if value is None:
+            continue
+        value = np.asarray(value, np.float64)
+        if value.shape[1:] != shape or len(value) < views or not np.all(np.isfinite(value)):
+            raise DataError(
+                f"{name} must be finite and of shape ({views}, {', '.join(map(str, shape))}), "
+                f"not {value.shape}"
+            )
+        checked[name] = value
+    return Scans(
+        **checked, column=scans.column, time_ns=scans.time_ns, frame=scans.frame, name=scans.name,
+        stripe_origin=scans.stripe_origin,
+    )  # fmt: skip
+
+
+def _rows(name: str, value: np.ndarray, n: int | None) -> np.ndarray:
+    """Return an array of shape (N, 3), f64."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu":
+        raise DataError(f"{name} must be numbers, not {array.dtype}")
+    if array.ndim != 2 or array.shape[1] != 3 or (n is not None and len(array) != n):
+        raise DataError(f"{name} must have the shape ({'N' if n is None else n}, 3), not {array.shape}")
+    return np.ascontiguousarray(array, np.float64)
+
+
+def _numbers(name: str, value: np.ndarray | None, n: int) -> np.ndarray | None:
+    """Return an array of shape (n,), i32, without negative numbers."""
+    if value is None:
+        return None
+    array = np.asarray(value)
+    if array.shape != (n,) or array.dtype.kind not in "iu":
+        raise DataError(f"{name} must be integers of shape ({n},), not {array.dtype} {array.shape}")
+    if n and (array.min() < 0 or array.max() >= 2**31):
+        raise DataError(f"{name} must be 0..2147483647")
+    return np.ascontiguousarray(array, np.int32)
+
+
+def arrange(scans: Scans, drop: np.ndarray | None = None) -> Arranged:
+    """Return the finite points that are not dropped, stripe after stripe.
+
+    Args:
+        scans: Checked scans.
+        drop: Rows to leave out, shape (N,), bool.
+
+    Raises:
+        DataError: Fewer than three usable points, or a single stripe.
+    """
+    usable = np.isfinite(scans.points).all(axis=1)
+    if scans.normals is not None:
+        usable &= np.isfinite(scans.normals).all(axis=1)
+    if drop is not None:
+        usable &= ~drop
+    row = np.arange(len(usable)) if usable.all() else np.flatnonzero(usable)
+    if len(row) < 3:
+        raise DataError(
+            f"{len(row)} of {len(usable)} points can be used, a segmentation needs at least 3",
+            hint="check for NaN rows" if len(usable) > 2 else "",
+        )
+    view = np.zeros(len(row), np.int32) if scans.view is None else scans.view[row]
+    if scans.stripe is None:
+        return _arranged(scans, row, view, None, None)
+    stripe = scans.stripe[row]
+    later = (view[1:] > view[:-1]) | ((view[1:] == view[:-1]) & (stripe[1:] >= stripe[:-1]))
+    if not later.all():
+        order = np.lexsort((stripe, view))  # stable: the order along a stripe is kept
+        row, view, stripe = row[order], view[order], stripe[order]
+    new = np.empty(len(row), bool)
+    new[0] = True
+    new[1:] = (stripe[1:] != stripe[:-1]) | (view[1:] != view[:-1])
+    first = np.flatnonzero(new)
+    if len(first) < 2:
+        raise DataError(
+            "all points lie on one stripe, a surface needs two",
+            hint="leave the stripe numbers out to treat the points as unorganised",
+        )
+    start = np.append(first, len(row)).astype(np.int32)
+    return _arranged(scans, row, view, np.cumsum(new, dtype=np.int32) - np.int32(1), start)
+
+
+def _arranged(
+    scans: Scans,
+    row: np.ndarray,
+    view: np.ndarray,
+    run: np.ndarray | None,
+    start: np.ndarray | None,
+) -> Arranged:
+    """Pick the rows of every array."""
+    whole = len(row) == len(scans.points) and (len(row) < 2 or bool(np.all(np.diff(row) == 1)))
+    normals = scans.normals
+    if normals is not None:
+        size = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = np.divide(normals, size, out=np.zeros_like(normals), where=size > 0)[row]
+    return Arranged(
+        row=row,
+        points=scans.points if whole else scans.points[row],
+        normals=normals,
+        view=np.ascontiguousarray(view, np.int32),
+        run=run,
+        start=start,
+    )

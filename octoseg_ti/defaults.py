@@ -1,0 +1,66 @@
+"""How the default derives its parameters from what was measured on the data."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from octoseg_ti.params import Params
+from octoseg_ti.types import Measurement
+
+LEAST_TOLERANCE = 0.03
+"""Deviation of the normals below which a cell counts as flat even on perfect data: 1.7 degrees."""
+NOISE_FLOORS = 2.0
+"""The tolerance stands this many noise floors of the normals above zero."""
+CELL_SPACINGS = 1.8
+"""Smallest cell in point spacings: about three points in a cell."""
+GAP_SPACINGS = 3.0
+"""A strip of triangles breaks where an edge is longer than this many spacings."""
+SPIKE_SPACINGS = 2.0
+"""A spike stands off from its neighbours by this many spacings: the corner point of a sharp edge
+stands off by 0.7 at most."""
+SPIKE_NOISES = 6.0
+"""... and by this many standard deviations of the noise."""
+ISOLATION_SPACINGS = 5.0
+"""A point is isolated when its neighbours on the stripe are farther than this many spacings."""
+PATCH_CELLS = 16.0
+"""A patch covers at least the area of this many smallest cells: a square of four by four."""
+HOMOGENEITY = (7.0, 0.1, 0.35)
+"""Angle between touching cells: this many tolerances, at least and at most so many radians."""
+
+
+def spacing_of(measured: Measurement) -> float:
+    """Return the larger of the two spacings [mm]: it limits what can be resolved."""
+    return max(measured.spacing_along, measured.spacing_across)
+
+
+def derive(params: Params, measured: Measurement) -> Params:
+    """Return the parameters with every None replaced by a value derived from the measurement.
+
+    Args:
+        params: Parameters, some of them None.
+        measured: Spacing and noise of the data.
+    """
+    spacing = spacing_of(measured)
+    cleaning, normals, grid, regions = params.cleaning, params.normals, params.grid, params.regions
+    if cleaning.spike is None:
+        stand_off = max(SPIKE_SPACINGS * spacing, SPIKE_NOISES * measured.noise)
+        cleaning = replace(cleaning, spike=stand_off)
+    if cleaning.isolation is None:
+        cleaning = replace(cleaning, isolation=ISOLATION_SPACINGS * spacing)
+    if normals.gap is None:
+        normals = replace(normals, gap=GAP_SPACINGS * spacing)
+    if grid.tolerance is None:
+        floor = NOISE_FLOORS * measured.normal_noise
+        grid = replace(grid, tolerance=min(1.0, max(LEAST_TOLERANCE, floor)))
+    if grid.min_cell is None:
+        grid = replace(grid, min_cell=CELL_SPACINGS * spacing)
+    assert grid.tolerance is not None and grid.min_cell is not None
+    if regions.homogeneity is None:
+        times, least, most = HOMOGENEITY
+        angle = min(most, max(least, times * grid.tolerance))
+        regions = replace(regions, homogeneity=angle)
+    if regions.min_points is None:
+        area = PATCH_CELLS * (CELL_SPACINGS * spacing) ** 2
+        one = measured.spacing_along * measured.spacing_across
+        regions = replace(regions, min_points=max(3, round(area / one)) if one > 0 else 3)
+    return replace(params, cleaning=cleaning, normals=normals, grid=grid, regions=regions)

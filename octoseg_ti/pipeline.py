@@ -1,0 +1,315 @@
+"""`segment`: from scan lines to patches, one stage after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from octoseg_ti.arrange import Arranged, arrange, as_scans
+from octoseg_ti.defaults import derive, spacing_of
+from octoseg_ti.device import runtime
+from octoseg_ti.device.profiling import Trace
+from octoseg_ti.params import PRESETS, Params
+from octoseg_ti.stages.assignment import assign_points, points_of_leaves
+from octoseg_ti.stages.cleaning import mark_outliers
+from octoseg_ti.stages.edges import edges_by_level, edges_by_radius, edges_by_reason
+from octoseg_ti.stages.grid import Grid, build_grid
+from octoseg_ti.stages.measure import stripe_noise, stripe_spacing
+from octoseg_ti.stages.moments import HI, LEVEL, LO, NORMAL, SIGMA, STOP, X, Z
+from octoseg_ti.stages.neighbors import neighbor_normals
+from octoseg_ti.stages.normals import edge_pair_normals
+from octoseg_ti.stages.planes import fit_planes
+from octoseg_ti.stages.regions import flood_fill, number_groups
+from octoseg_ti.stages.registration import to_world
+from octoseg_ti.types import NONE, Cells, EdgeClass, Measurement, Scans, Segmentation
+
+STAGES = ("cleaning", "normals", "registration", "measure", "grid", "edges", "regions", "patches")
+"""The stages, in order."""
+
+# A cell bends away from its mean plane by 0.13 tolerance times its size at most while its normals
+# are within the tolerance; twice that can only be a step.
+_FLATNESS = 0.25
+# The line through two cells may leave the surface by half a tolerance.
+_CHORD = 0.5
+# An edge point joins a patch whose plane is this near: in smallest cells, plus three noises.
+_JOIN_CELLS = 0.25
+
+
+def segment(
+    data: Scans | np.ndarray,
+    params: Params | None = None,
+    *,
+    normals: np.ndarray | None = None,
+    stripe: np.ndarray | None = None,
+    view: np.ndarray | None = None,
+    preset: str = "default",
+    trace: Trace | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Segmentation:
+    """Segment scans, or any point cloud, into surface patches.
+
+    Args:
+        data: Scans, or positions [mm], shape (N, 3).
+        params: Parameters; what is None is derived from the data. Default: those of the preset.
+        normals: Unit normals of bare positions, shape (N, 3); estimated when missing.
+        stripe: Stripe number of bare positions, shape (N,), in order along each stripe; without it
+            normals come from neighbourhoods.
+        view: View number of bare positions, shape (N,).
+        preset: "default", or "paper" for the literal method; used when ``params`` is None.
+        trace: Collects the wall time of the stages.
+        progress: Called with the name of every stage and the share of work done before it.
+
+    Returns:
+        The segmentation, rows in the order of the input. Rows with NaN and rows that cleaning
+        marked keep their place, with label -1 and outlier 1.
+
+    Raises:
+        DataError: The input cannot be segmented; the message says why.
+        ValueError: Unknown preset.
+    """
+    if params is None:
+        if preset not in PRESETS:
+            raise ValueError(f"preset must be one of {', '.join(PRESETS)}, not {preset!r}")
+        params = PRESETS[preset]()
+    scans = as_scans(data, normals, stripe, view)
+    runtime.ensure_started()
+    trace = trace if trace is not None else Trace()
+
+    def stage(name: str):  # type: ignore[no-untyped-def]
+        if progress is not None:
+            progress(name, STAGES.index(name) / len(STAGES))
+        return trace.stage(name, points=len(scans))
+
+    with stage("cleaning"):
+        arranged, measured, params = clean(scans, params)
+    with stage("normals"):
+        normal, measured = estimate_normals(scans, arranged, measured, params)
+    with stage("registration"):
+        point, normal = register(scans, arranged, normal)
+    with stage("measure"):
+        measured = measure_noise(arranged, point, normal, measured, params)
+        params = derive(params, measured)
+    with stage("grid"):
+        signed = arranged.run is not None or scans.normals is not None
+        grid = subdivide(point, normal, measured, params, signed)
+    with stage("edges"):
+        leaves, edge = find_edges(grid, params)
+    with stage("regions"):
+        cell_label = grow_regions(grid, leaves, edge, measured, params)
+    with stage("patches"):
+        result = assemble(scans, arranged, point, normal, grid, leaves, edge, cell_label, measured, params)
+    return replace(result, seconds=trace.seconds)
+
+
+def clean(scans: Scans, params: Params) -> tuple[Arranged, Measurement, Params]:
+    """Measure the spacing, mark outliers and leave them out."""
+    arranged = arrange(scans)
+    if arranged.run is None or arranged.start is None:
+        return arranged, Measurement(spacing_along=0, spacing_across=0, noise=0, normal_noise=0), params
+    along, across = stripe_spacing(arranged.points, arranged.start, arranged.run, arranged.view)
+    measured = Measurement(
+        spacing_along=along or across, spacing_across=across or along, noise=0.0, normal_noise=0.0
+    )
+    params = replace(
+        params,
+        cleaning=derive(params, measured).cleaning,
+        normals=derive(params, measured).normals,
+    )
+    assert params.cleaning.spike is not None and params.cleaning.isolation is not None
+    if params.cleaning.enabled:
+        marked = mark_outliers(
+            arranged.points,
+            arranged.start,
+            arranged.run,
+            spike=params.cleaning.spike,
+            isolation=params.cleaning.isolation,
+        )
+        if marked.any():
+            drop = np.zeros(len(scans), bool)
+            drop[arranged.row[marked > 0]] = True
+            arranged = arrange(scans, drop)
+    return arranged, measured, params
+
+
+def estimate_normals(
+    scans: Scans, arranged: Arranged, measured: Measurement, params: Params
+) -> tuple[np.ndarray, Measurement]:
+    """Return the normals of the arranged points, in the frame of the scans."""
+    if arranged.run is None or arranged.start is None:
+        if scans.origin is not None:
+            outward = scans.origin[arranged.view] - arranged.points
+        else:
+            low, high = arranged.points.min(axis=0), arranged.points.max(axis=0)
+            outward = arranged.points - (low + high) / 2.0
+        estimated, measured = neighbor_normals(arranged.points, outward, params.normals.neighbors)
+        return (estimated if arranged.normals is None else arranged.normals), measured
+    if arranged.normals is not None:
+        return arranged.normals, measured
+    origin = scans.origin
+    if origin is not None and scans.frame == "view" and scans.T_world_view is not None:
+        to_view = np.linalg.inv(scans.T_world_view[: len(origin)])
+        origin = np.einsum("vij,vj->vi", to_view[:, :3, :3], origin) + to_view[:, :3, 3]
+    assert params.normals.gap is not None
+    estimated = edge_pair_normals(
+        arranged.points,
+        arranged.start,
+        arranged.view,
+        gap=params.normals.gap,
+        rule=params.normals.rule,
+        weight=params.normals.weight,
+        origin=origin,
+    )
+    return estimated, measured
+
+
+def register(
+    scans: Scans, arranged: Arranged, normal: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and normals in the world."""
+    if scans.frame == "world" or scans.T_world_view is None:
+        return arranged.points, normal
+    return to_world(arranged.points, normal, arranged.view, scans.T_world_view)
+
+
+def measure_noise(
+    arranged: Arranged,
+    point: np.ndarray,
+    normal: np.ndarray,
+    measured: Measurement,
+    params: Params,
+) -> Measurement:
+    """Return the measurement with the noise along the stripes filled in."""
+    if arranged.run is None or arranged.start is None:
+        return measured
+    assert params.normals.gap is not None
+    noise, tilt = stripe_noise(point, normal, arranged.start, arranged.run, params.normals.gap)
+    return replace(measured, noise=noise, normal_noise=tilt)
+
+
+def subdivide(
+    point: np.ndarray, normal: np.ndarray, measured: Measurement, params: Params, signed: bool
+) -> Grid:
+    """Build the sparse grid."""
+    assert params.grid.tolerance is not None and params.grid.min_cell is not None
+    literal = params.edges.rule == "levels"
+    return build_grid(
+        point,
+        normal,
+        tolerance=params.grid.tolerance,
+        divisions=params.grid.divisions,
+        min_cell=params.grid.min_cell,
+        min_points=params.grid.min_points,
+        flatness=float("inf") if literal else _FLATNESS,
+        noise=measured.noise,
+        signed=signed,
+    )
+
+
+def find_edges(grid: Grid, params: Params) -> tuple[np.ndarray, np.ndarray]:
+    """Return the leaves in Morton order, and the edge class of each."""
+    node = runtime.download(grid.node)[: grid.count]
+    leaves = np.flatnonzero(runtime.download(grid.child)[: grid.count, 0] == -2)
+    leaves = leaves[np.argsort(node[leaves, LO], kind="stable")]
+    level = node[leaves, LEVEL]
+    if params.edges.rule == "reason":
+        return leaves, edges_by_reason(node[leaves, STOP])
+    if params.edges.rule == "levels":
+        return leaves, edges_by_level(level, params.edges.smallest_levels, params.edges.fillet_levels)
+    assert params.grid.tolerance is not None
+    size = grid.size / 2.0**level
+    return leaves, edges_by_radius(size, params.grid.tolerance, params.edges.radius)
+
+
+def grow_regions(
+    grid: Grid, leaves: np.ndarray, edge: np.ndarray, measured: Measurement, params: Params
+) -> np.ndarray:
+    """Return the label of every node, -1 for edge cells and for groups that are too small."""
+    assert params.regions.homogeneity is not None and params.regions.min_points is not None
+    assert params.grid.tolerance is not None
+    literal = params.edges.rule == "levels"
+    takes_part = np.zeros(grid.count, bool)
+    takes_part[leaves[edge == int(EdgeClass.NONE)]] = True
+    group = flood_fill(
+        grid,
+        takes_part,
+        homogeneity=params.regions.homogeneity,
+        chord=float("inf") if literal else _CHORD * params.grid.tolerance,
+        slack=3.0 * measured.noise,
+    )
+    node = runtime.download(grid.node)[: grid.count]
+    return number_groups(group, node[:, HI] - node[:, LO], params.regions.min_points)
+
+
+def assemble(
+    scans: Scans,
+    arranged: Arranged,
+    point: np.ndarray,
+    normal: np.ndarray,
+    grid: Grid,
+    leaves: np.ndarray,
+    edge: np.ndarray,
+    cell_label: np.ndarray,
+    measured: Measurement,
+    params: Params,
+) -> Segmentation:
+    """Give edge points back, number the patches by size, and bring all into the input order."""
+    assert params.grid.min_cell is not None
+    node = runtime.download(grid.node)[: grid.count]
+    core = points_of_leaves(grid, leaves, cell_label[leaves])
+    label = core
+    if params.regions.assign_edges:
+        finest = grid.size / 2.0**grid.depth
+        limit = _JOIN_CELLS * finest + 3.0 * measured.noise
+        label = assign_points(grid, cell_label, core, reach=finest, limit=limit)
+    patches = int(cell_label.max(initial=NONE)) + 1
+    size = np.bincount(label[label >= 0], minlength=patches)
+    rank = np.argsort(-size, kind="stable")
+    name = np.full(patches + 1, NONE, np.int32)
+    name[rank] = np.arange(patches, dtype=np.int32)
+    label, core, cell_label = name[label], name[core], name[cell_label]
+    flat = 2.0 * measured.noise + 0.02 * spacing_of(measured)
+    kind, parameters, residual = fit_planes(grid, core, patches, limit=flat)
+
+    row = arranged.row[runtime.download(grid.order)]
+    n = len(scans)
+    labels, outlier = np.full(n, NONE, np.int32), np.ones(n, np.uint8)
+    edges, levels = np.zeros(n, np.uint8), np.full(n, -1, np.int8)
+    labels[row], outlier[row] = label, 0
+    edges[row] = points_of_leaves(grid, leaves, edge)
+    levels[row] = points_of_leaves(grid, leaves, node[leaves, LEVEL].astype(np.int8))
+    normals, points = np.zeros((n, 3), np.float32), np.full((n, 3), np.nan)
+    normals[arranged.row], points[arranged.row] = normal, point
+    left_out = np.flatnonzero(outlier)
+    if len(left_out):
+        points[left_out] = scans_in_world(scans, left_out)
+    mean = runtime.download(grid.mean)[leaves]
+    cells = Cells(
+        corner=grid.corner + node[leaves, X : Z + 1] * (grid.size / 2.0 ** node[leaves, LEVEL])[:, None],
+        size=grid.size / 2.0 ** node[leaves, LEVEL],
+        level=node[leaves, LEVEL].astype(np.int8),
+        count=node[leaves, HI] - node[leaves, LO],
+        normal=mean[:, NORMAL : NORMAL + 3].astype(np.float32),
+        sigma=mean[:, SIGMA].astype(np.float32),
+        stop=node[leaves, STOP].astype(np.uint8),
+        edge=edge,
+        label=cell_label[leaves],
+        initial_size=grid.size,
+    )
+    return Segmentation(
+        points=points, normals=normals, labels=labels, edge=edges, level=levels, outlier=outlier,
+        kind=kind, surface=np.arange(patches, dtype=np.int32), parameters=parameters,
+        residual=residual, cells=cells, stripe=scans.stripe, view=scans.view, params=params,
+        measured=measured, passes=grid.passes, name=scans.name,
+    )  # fmt: skip
+
+
+def scans_in_world(scans: Scans, rows: np.ndarray) -> np.ndarray:
+    """Return the world positions of some rows [mm], shape (len(rows), 3)."""
+    points = scans.points[rows]
+    if scans.frame == "world" or scans.T_world_view is None:
+        return points
+    view = np.zeros(len(rows), np.int32) if scans.view is None else scans.view[rows]
+    pose = scans.T_world_view[view]
+    return np.einsum("nij,nj->ni", pose[:, :3, :3], points) + pose[:, :3, 3]
