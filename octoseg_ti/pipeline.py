@@ -12,7 +12,8 @@ from octoseg_ti.defaults import derive, spacing_of
 from octoseg_ti.device import runtime
 from octoseg_ti.device.profiling import Trace
 from octoseg_ti.params import PRESETS, Params
-from octoseg_ti.stages.assignment import assign_points, points_of_leaves
+from octoseg_ti.stages.assignment import assign_points, points_of_leaves, unclaimed_cells
+from octoseg_ti.stages.bends import split_at_bends
 from octoseg_ti.stages.cleaning import mark_outliers
 from octoseg_ti.stages.edges import edges_by_level, edges_by_radius, edges_by_reason
 from octoseg_ti.stages.grid import Grid, build_grid
@@ -35,6 +36,8 @@ _FLATNESS = 0.25
 _CHORD = 0.5
 # An edge point joins a patch whose plane is this near: in smallest cells, plus three noises.
 _JOIN_CELLS = 0.25
+# A cell on a bend joins a face whose normal is this many tolerances away at most.
+_BEND_TOLERANCES = 2.0
 
 
 def segment(
@@ -97,9 +100,11 @@ def segment(
     with stage("edges"):
         leaves, edge = find_edges(grid, params)
     with stage("regions"):
-        cell_label = grow_regions(grid, leaves, edge, measured, params)
+        cell_label, label = grow_regions(grid, leaves, edge, measured, params)
     with stage("patches"):
-        result = assemble(scans, arranged, point, normal, grid, leaves, edge, cell_label, measured, params)
+        result = assemble(
+            scans, arranged, point, normal, grid, leaves, edge, cell_label, label, measured, params
+        )
     return replace(result, seconds=trace.seconds)
 
 
@@ -224,22 +229,51 @@ def find_edges(grid: Grid, params: Params) -> tuple[np.ndarray, np.ndarray]:
 
 def grow_regions(
     grid: Grid, leaves: np.ndarray, edge: np.ndarray, measured: Measurement, params: Params
-) -> np.ndarray:
-    """Return the label of every node, -1 for edge cells and for groups that are too small."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the label of every node, -1 for edge cells and small groups, and of every sorted point."""
     assert params.regions.homogeneity is not None and params.regions.min_points is not None
     assert params.grid.tolerance is not None
     literal = params.edges.rule == "levels"
+    rule = {
+        "homogeneity": params.regions.homogeneity,
+        "chord": float("inf") if literal else _CHORD * params.grid.tolerance,
+        "slack": 3.0 * measured.noise,
+    }
     takes_part = np.zeros(grid.count, bool)
     takes_part[leaves[edge == int(EdgeClass.NONE)]] = True
-    group = flood_fill(
-        grid,
-        takes_part,
-        homogeneity=params.regions.homogeneity,
-        chord=float("inf") if literal else _CHORD * params.grid.tolerance,
-        slack=3.0 * measured.noise,
-    )
+    group = flood_fill(grid, takes_part, **rule)
+    bend = np.zeros(grid.count, bool)
+    if not literal:
+        whole = group
+        group = split_at_bends(
+            grid,
+            whole,
+            min_points=params.regions.min_points,
+            flat=params.grid.tolerance,
+            noise=measured.normal_noise,
+            **rule,
+        )
+        bend = (group < 0) & (whole >= 0)
     node = runtime.download(grid.node)[: grid.count]
-    return number_groups(group, node[:, HI] - node[:, LO], params.regions.min_points)
+    count = node[:, HI] - node[:, LO]
+    cell_label = number_groups(group, count, params.regions.min_points)
+    if not params.regions.assign_edges:
+        return cell_label, points_of_leaves(grid, leaves, cell_label[leaves])
+    finest = grid.size / 2.0**grid.depth
+    fit = {
+        "bend": bend,
+        "reach": finest,
+        "limit": _JOIN_CELLS * finest + 3.0 * measured.noise,
+        "angle": _BEND_TOLERANCES * params.grid.tolerance,
+    }
+    label = assign_points(grid, leaves, cell_label, **fit)
+    if bend.any():
+        # What no face claims of the bends is a surface of its own.
+        bend = unclaimed_cells(grid, leaves, label, bend)
+        group = np.where(bend, flood_fill(grid, bend, **rule), group)
+        cell_label = number_groups(group, count, params.regions.min_points)
+        label = assign_points(grid, leaves, cell_label, **fit)
+    return cell_label, label
 
 
 def assemble(
@@ -251,24 +285,19 @@ def assemble(
     leaves: np.ndarray,
     edge: np.ndarray,
     cell_label: np.ndarray,
+    label: np.ndarray,
     measured: Measurement,
     params: Params,
 ) -> Segmentation:
-    """Give edge points back, number the patches by size, and bring all into the input order."""
-    assert params.grid.min_cell is not None
+    """Number the patches by size, find the planes, and bring all into the input order."""
     node = runtime.download(grid.node)[: grid.count]
-    core = points_of_leaves(grid, leaves, cell_label[leaves])
-    label = core
-    if params.regions.assign_edges:
-        finest = grid.size / 2.0**grid.depth
-        limit = _JOIN_CELLS * finest + 3.0 * measured.noise
-        label = assign_points(grid, cell_label, core, reach=finest, limit=limit)
     patches = int(cell_label.max(initial=NONE)) + 1
     size = np.bincount(label[label >= 0], minlength=patches)
     rank = np.argsort(-size, kind="stable")
     name = np.full(patches + 1, NONE, np.int32)
     name[rank] = np.arange(patches, dtype=np.int32)
-    label, core, cell_label = name[label], name[core], name[cell_label]
+    label, cell_label = name[label], name[cell_label]
+    core = points_of_leaves(grid, leaves, cell_label[leaves])
     flat = 2.0 * measured.noise + 0.02 * spacing_of(measured)
     kind, parameters, residual = fit_planes(grid, core, patches, limit=flat)
 

@@ -11,6 +11,7 @@ from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.stages.grid import Grid, find_node
 from octoseg_ti.stages.moments import HI, LO, POINT
+from octoseg_ti.types import NONE
 
 _ROUNDS = 3
 
@@ -19,6 +20,7 @@ _ROUNDS = 3
 def _join(
     reach: ti.f64,
     limit: ti.f64,
+    cosine: ti.f64,
     finest: ti.f64,
     depth: ti.i32,
     shape: ti.types.vector(3, ti.i32),
@@ -28,13 +30,14 @@ def _join(
     root_in: I32Array,
     mean_in: F64Rows,
     cell_label_in: I32Array,
-    todo_in: I32Array,
+    todo_in: I32Rows,
     # Out:
     label_inout: I32Array,
 ):
     """Give points without a label that of the nearest mean plane among the cells at a distance."""
-    for t in todo_in:
-        i = todo_in[t]
+    for t in range(todo_in.shape[0]):
+        i = todo_in[t, 0]
+        bend = todo_in[t, 1]
         p = row(point_in, i)
         best = limit
         chosen = -1
@@ -49,6 +52,8 @@ def _join(
                 d = p - vec3(mean_in[c, POINT], mean_in[c, POINT + 1], mean_in[c, POINT + 2])
                 off = ti.abs(d.dot(row(mean_in, c)))
                 far = d.norm()
+                if bend >= 0 and ti.abs(row(mean_in, bend).dot(row(mean_in, c))) < cosine:
+                    off = limit
                 # Ties go to the nearer cell, then to the smaller label: never to the order.
                 if off < best or (off == best and chosen >= 0 and far < nearest):
                     best = off
@@ -73,30 +78,45 @@ def points_of_leaves(grid: Grid, leaves: np.ndarray, values: np.ndarray) -> np.n
     return np.repeat(values, node[leaves, HI] - node[leaves, LO])
 
 
-def assign_points(grid: Grid, cell_label: np.ndarray, label: np.ndarray, *, reach: float, limit: float) -> np.ndarray:
+def assign_points(
+    grid: Grid,
+    leaves: np.ndarray,
+    cell_label: np.ndarray,
+    *,
+    bend: np.ndarray,
+    reach: float,
+    limit: float,
+    angle: float,
+) -> np.ndarray:
     """Give the points without a label to the patch whose surface they lie on.
 
     Args:
         grid: The sparse grid.
+        leaves: The nodes that are leaves, in Morton order, shape (C,).
         cell_label: Label of every node, -1 for edge cells and for those of no patch, shape (M,), i32.
-        label: Label of every sorted point, shape (n,), i32.
+        bend: Nodes on a bend, shape (M,), bool: their normals are good, so they must agree too.
         reach: How far to look in the first round [mm], about the smallest cell.
         limit: Largest distance of a point from the mean plane of the cell whose patch it joins [mm].
+        angle: Largest angle between the normals of a bend and of the cell whose patch it joins [rad].
 
     Returns:
-        The labels with those that were found filled in, shape (n,), i32.
+        Label of every sorted point, -1 where no patch fits, shape (n,), i32.
     """
     runtime.ensure_started()
-    label = np.ascontiguousarray(label, np.int32).copy()
+    label = np.ascontiguousarray(points_of_leaves(grid, leaves, cell_label[leaves]), np.int32)
+    if not np.any(cell_label >= 0):
+        return label
+    bend_of = points_of_leaves(grid, leaves, np.where(bend[leaves], leaves, NONE).astype(np.int32))
     device_cell = runtime.upload(cell_label.astype(np.int32))
     for r in range(1, _ROUNDS + 1):
         todo = np.flatnonzero(label < 0).astype(np.int32)
-        if len(todo) == 0 or not np.any(cell_label >= 0):
+        if len(todo) == 0:
             break
         device_label = runtime.upload(label)
         _join(
             r * reach,
             limit,
+            float(np.cos(angle)),
             2.0**grid.depth / grid.size,
             grid.depth,
             ti.Vector(grid.shape),
@@ -105,8 +125,27 @@ def assign_points(grid: Grid, cell_label: np.ndarray, label: np.ndarray, *, reac
             grid.root,
             grid.mean,
             device_cell,
-            runtime.upload(todo),
+            runtime.upload(np.stack([todo, bend_of[todo]], axis=1)),
             device_label,
         )
         label = runtime.download(device_label)
     return label
+
+
+def unclaimed_cells(grid: Grid, leaves: np.ndarray, label: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Say which nodes kept most of their points without a label.
+
+    Args:
+        grid: The sparse grid.
+        leaves: The nodes that are leaves, in Morton order, shape (C,).
+        label: Label of every sorted point, shape (n,), i32.
+        nodes: The nodes in question, shape (M,), bool.
+
+    Returns:
+        Nodes in question whose points are mostly unlabelled, shape (M,), bool.
+    """
+    node = runtime.download(grid.node)
+    free = np.add.reduceat((label < 0).astype(np.int32), node[leaves, LO])
+    mostly = np.zeros(grid.count, bool)
+    mostly[leaves] = 2 * free > node[leaves, HI] - node[leaves, LO]
+    return mostly & nodes
