@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from scanner_sim.part import FlatPart, Part
 
 _TRIAL_RAYS = 40_000
-_SURPLUS = 1.004  # aim this far above the wanted number; what is too much is thinned out
+_SURPLUS = 1.01  # aim this far above the wanted number; what is too much is thinned out
 _LIFT = 1e-6  # shadow rays start this far above the surface [mm]
 _ATTEMPTS = 6
 
@@ -103,7 +103,8 @@ def simulate(
         position=np.concatenate([p.position[k] for p, k in zip(passes, keep, strict=True)]),
         normal=np.concatenate([p.normal[k] for p, k in zip(passes, keep, strict=True)]),
         surface=np.concatenate([p.surface[k] for p, k in zip(passes, keep, strict=True)]),
-        pitch=max(across, along),
+        stripe=scans.stripe,
+        column=scans.column,
         reach=2.0 * max(across, along) / max(math.cos(scanner.incidence_limit), 0.3),
         info={
             "part": part.name,
@@ -136,12 +137,14 @@ def _pitches(
     across = math.sqrt(area / _TRIAL_RAYS * scanner.aspect)
     if wanted is None:
         return across, across / scanner.aspect
-    seen = sum(
-        len(_scan(flat, limits, scanner, view, across, across / scanner.aspect).stripe)
-        for view in views
-    )
-    keep = (1.0 - scanner.dropout) * (1.0 - scanner.lost_stripes)
-    across *= math.sqrt(max(seen, 1) * keep / (wanted * _SURPLUS))
+    trial = [
+        _scan(flat, limits, scanner, view, across, across / scanner.aspect) for view in views
+    ]
+    # Points go with the square of the fineness, ends of stripes (lost ones) only linearly.
+    points = sum(len(scan.stripe) for scan in trial)
+    points *= (1.0 - scanner.dropout) * (1.0 - scanner.lost_stripes)
+    ends = sum(len(np.unique(scan.stripe)) for scan in trial) * scanner.lost_ends
+    across /= (ends + math.sqrt(ends**2 + points * wanted * _SURPLUS)) / max(points, 1.0)
     return across, across / scanner.aspect
 
 
