@@ -7,8 +7,9 @@ from dataclasses import replace
 from octoseg_ti.params import Params
 from octoseg_ti.types import Measurement
 
-LEAST_TOLERANCE = 0.03
-"""Deviation of the normals below which a cell counts as flat even on perfect data: 1.7 degrees."""
+LEAST_TOLERANCE = 0.055
+"""Deviation of the normals below which a cell counts as flat even on perfect data. By the law
+s = sqrt(6) tolerance r a sphere of 13 spacings radius then fills a smallest cell of 1.8 spacings."""
 NOISE_FLOORS = 2.0
 """The tolerance stands this many noise floors of the normals above zero."""
 CELL_SPACINGS = 1.8

@@ -36,6 +36,8 @@ _FLATNESS = 0.25
 _CHORD = 0.5
 # An edge point joins a patch whose plane is this near: in smallest cells, plus three noises.
 _JOIN_CELLS = 0.25
+# A patch has inner cells of this area, in smallest cells.
+_CORE_CELLS = 4.0
 # A cell on a bend joins a face whose normal is this many tolerances away at most.
 _BEND_TOLERANCES = 2.0
 
@@ -254,12 +256,14 @@ def grow_regions(
             **rule,
         )
         bend = (group < 0) & (whole >= 0)
-    node = runtime.download(grid.node)[: grid.count]
-    count = node[:, HI] - node[:, LO]
-    cell_label = number_groups(group, count, params.regions.min_points)
+    finest = grid.size / 2.0**grid.depth
+    size = {
+        "min_points": params.regions.min_points,
+        "min_core": 0.0 if literal else _CORE_CELLS * finest**2,
+    }
+    cell_label = number_groups(grid, group, **size)
     if not params.regions.assign_edges:
         return cell_label, points_of_leaves(grid, leaves, cell_label[leaves])
-    finest = grid.size / 2.0**grid.depth
     fit = {
         "bend": bend,
         "reach": finest,
@@ -271,7 +275,7 @@ def grow_regions(
         # What no face claims of the bends is a surface of its own.
         bend = unclaimed_cells(grid, leaves, label, bend)
         group = np.where(bend, flood_fill(grid, bend, **rule), group)
-        cell_label = number_groups(group, count, params.regions.min_points)
+        cell_label = number_groups(grid, group, **size)
         label = assign_points(grid, leaves, cell_label, **fit)
     return cell_label, label
 

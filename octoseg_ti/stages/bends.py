@@ -4,9 +4,10 @@ A bend that is wider than the smallest cell leaves a chain of agreeing cells, th
 passes from face to face. The paper's remedy is to remove the smallest cells by hand until the faces
 come apart (section 3.4). Here each region is tried with every number of smallest sizes removed, and
 the cut is accepted when the turning of the normals is concentrated in what was removed: every face
-is flat compared with the angle to its nearest sister. A surface of even curvature never passes: cut
-into pieces that each turn by t, a piece has the deviation t / sqrt(12) = 0.29 t, and its sister
-stands at the angle t.
+is flat compared with the angle to its nearest sister. A surface of even curvature never passes: the
+sizes of its cells alternate with its direction in the grid, so that pieces that turn by t are left
+with gaps of t between them; such a piece has the deviation t / sqrt(12), and its sister stands at
+the angle 2 t: a ratio of 0.14.
 """
 
 import numpy as np
@@ -17,16 +18,24 @@ from octoseg_ti.stages.moments import HI, LEVEL, LO, NORMAL
 from octoseg_ti.stages.regions import flood_fill
 from octoseg_ti.types import NONE
 
-# Half of what an evenly curved surface shows.
-_FLAT = 0.15
+# Well below the 0.14 of an evenly curved surface.
+_FLAT = 0.08
 # The faces must hold most of the region: else it is a curved surface with flat spots.
 _COVERAGE = 0.6
 # ... and most of what the faces hold must be flat, so that a face may still be cut further.
 _FLAT_SHARE = 0.8
+# Faces at a smaller angle are not told apart [rad].
+_LEAST_ANGLE = 0.1
 
 
 def _faces_are_flat(
-    piece: np.ndarray, count: np.ndarray, normal: np.ndarray, noise: float, signed: bool
+    piece: np.ndarray,
+    count: np.ndarray,
+    normal: np.ndarray,
+    *,
+    noise: float,
+    least_angle: float,
+    signed: bool,
 ) -> bool:
     """Say whether the pieces are flat faces that stand at an angle to each other.
 
@@ -35,13 +44,13 @@ def _faces_are_flat(
         count: Points of every cell, shape (c,).
         normal: Mean normal of every cell, shape (c, 3).
         noise: Deviation of the normals that is noise [rad].
+        least_angle: Pieces at a smaller angle are parallel; they say nothing about bends [rad].
         signed: Normals have a side.
     """
     pieces = int(piece.max(initial=NONE)) + 1
     inside = piece >= 0
     if pieces < 2 or count[inside].sum() < _COVERAGE * count.sum():
         return False
-    axis = np.zeros((pieces, 3))
     tensor = np.zeros((pieces, 3, 3))
     size = np.bincount(piece[inside], weights=count[inside], minlength=pieces)
     n = normal[inside]
@@ -58,8 +67,9 @@ def _faces_are_flat(
         cosine = axis @ axis.T
     else:
         cosine = np.abs(axis @ axis.T)
-    np.fill_diagonal(cosine, -1.0)
+    cosine[cosine > np.cos(least_angle)] = -1.0  # itself, and its parallels
     nearest = np.arccos(np.clip(cosine.max(axis=1), -1.0, 1.0))
+    nearest[(cosine == -1.0).all(axis=1)] = 0.0
     flat = np.sqrt(spread) <= _FLAT * nearest
     return flat.sum() >= 2 and bool(size[flat].sum() >= _FLAT_SHARE * size.sum())
 
@@ -126,7 +136,14 @@ def split_at_bends(
             names, numbered = np.unique(pieces[cells], return_inverse=True)
             numbered = numbered - int(names[0] == NONE)
             normal = mean[cells, NORMAL : NORMAL + 3]
-            if _faces_are_flat(numbered, count[cells], normal, noise, grid.signed):
+            if _faces_are_flat(
+                numbered,
+                count[cells],
+                normal,
+                noise=noise,
+                least_angle=max(_LEAST_ANGLE, 2.0 * flat),
+                signed=grid.signed,
+            ):
                 result[cells] = pieces[cells]
                 takes_part[cells] &= pieces[cells] >= 0
     return result

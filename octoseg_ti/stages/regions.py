@@ -11,7 +11,7 @@ from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.unionfind import unite
 from octoseg_ti.stages.grid import Grid, find_node
-from octoseg_ti.stages.moments import LEVEL, POINT, X, Y, Z
+from octoseg_ti.stages.moments import HI, LEVEL, LO, POINT, X, Y, Z
 from octoseg_ti.types import NONE
 
 
@@ -90,6 +90,35 @@ def _flatten(
             group_out[c] = x
 
 
+@ti.kernel
+def _mark_borders(
+    depth: ti.i32,
+    shape: ti.types.vector(3, ti.i32),
+    # In:
+    node_in: I32Rows,
+    child_in: I32Rows,
+    root_in: I32Array,
+    group_in: I32Array,
+    size_in: I32Array,
+    # Out:
+    border_inout: I32Array,
+):
+    """Mark the leaves that touch a leaf of a larger group."""
+    for c in group_in:
+        if group_in[c] >= 0:
+            level = node_in[c, LEVEL]
+            for o in range(27):
+                x = node_in[c, X] + o // 9 - 1
+                y = node_in[c, Y] + (o // 3) % 3 - 1
+                z = node_in[c, Z] + o % 3 - 1
+                b = find_node(x, y, z, level, shape, depth, root_in, child_in)
+                if b >= 0 and group_in[b] >= 0 and group_in[b] != group_in[c]:
+                    if size_in[group_in[b]] > size_in[group_in[c]]:
+                        border_inout[c] = 1
+                    else:
+                        border_inout[b] = 1
+
+
 def flood_fill(
     grid: Grid,
     leaf: np.ndarray,
@@ -135,22 +164,56 @@ def flood_fill(
     return runtime.download(group)
 
 
-def number_groups(group: np.ndarray, count: np.ndarray, min_points: int) -> np.ndarray:
-    """Number the groups by size, largest first; small groups get -1.
+def inner_cells(grid: Grid, group: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return the leaves of groups that touch no leaf of a larger group, shape (M,), bool.
 
     Args:
-        group: Group of every node, shape (M,), i32, -1 = none.
-        count: Points of every node, shape (M,), i32.
+        grid: The sparse grid.
+        group: Group of every node, -1 = none, shape (M,), i32; only leaves have one.
+        size: Points of every group, by its name, shape (M,).
+    """
+    runtime.ensure_started()
+    border = runtime.zeros(grid.count, np.int32)
+    _mark_borders(
+        grid.depth,
+        ti.Vector(grid.shape),
+        grid.node,
+        grid.child,
+        grid.root,
+        runtime.upload(group),
+        runtime.upload(size.astype(np.int32)),
+        border,
+    )
+    return (group >= 0) & (runtime.download(border) == 0)
+
+
+def number_groups(
+    grid: Grid, group: np.ndarray, min_points: int, min_core: float = 0.0
+) -> np.ndarray:
+    """Number the groups by size, largest first; groups too small for a patch get -1.
+
+    Args:
+        grid: The sparse grid.
+        group: Group of every node, named by its first node, -1 = none, shape (M,), i32.
         min_points: A group with fewer points is no patch.
+        min_core: A patch has inner cells (touching no larger group) of this area [mm^2]; what
+            has none is a strip along an edge, where the normals of two faces were averaged.
 
     Returns:
         Label of every node, shape (M,), i32. Groups of equal size are ordered by their first node,
         which depends on where they are, not on the order of the points.
     """
+    node = runtime.download(grid.node)[: grid.count]
+    count = node[:, HI] - node[:, LO]
     inside = group >= 0
-    size = np.bincount(group[inside], weights=count[inside], minlength=len(group)).astype(np.int64)
-    kept = np.flatnonzero(size >= max(1, min_points))
-    kept = kept[np.argsort(-size[kept], kind="stable")]
-    name = np.full(len(group) + 1, NONE, np.int32)
-    name[kept] = np.arange(len(kept), dtype=np.int32)
-    return name[np.where(inside, group, len(group))]
+    size = np.bincount(group[inside], weights=count[inside], minlength=grid.count)
+    kept = size >= max(1, min_points)
+    if min_core > 0.0:
+        inner = inner_cells(grid, group, size)
+        area = (grid.size / 2.0 ** node[inner, LEVEL]) ** 2
+        kept &= np.bincount(group[inner], weights=area, minlength=grid.count) >= min_core
+    names = np.flatnonzero(kept)
+    names = names[np.argsort(-size[names], kind="stable")]
+    label = np.full(grid.count + 1, NONE, np.int32)
+    label[names] = np.arange(len(names), dtype=np.int32)
+    return label[np.where(inside, group, grid.count)]
