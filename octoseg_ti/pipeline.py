@@ -12,7 +12,7 @@ from octoseg_ti.defaults import derive, spacing_of
 from octoseg_ti.device import runtime
 from octoseg_ti.device.profiling import Trace
 from octoseg_ti.params import PRESETS, Params
-from octoseg_ti.stages.assignment import assign_points, points_of_leaves, unclaimed_cells
+from octoseg_ti.stages.assignment import assign_points, points_of_leaves, claimed_share
 from octoseg_ti.stages.bends import split_at_bends
 from octoseg_ti.stages.cleaning import mark_outliers
 from octoseg_ti.stages.edges import edges_by_level, edges_by_radius, edges_by_reason
@@ -22,7 +22,7 @@ from octoseg_ti.stages.moments import HI, LEVEL, LO, NORMAL, SIGMA, STOP, X, Z
 from octoseg_ti.stages.neighbors import neighbor_normals
 from octoseg_ti.stages.normals import edge_pair_normals
 from octoseg_ti.stages.planes import fit_planes
-from octoseg_ti.stages.regions import flood_fill, number_groups
+from octoseg_ti.stages.regions import flood_fill, number_groups, strips
 from octoseg_ti.stages.registration import to_world
 from octoseg_ti.types import NONE, Cells, EdgeClass, Measurement, Scans, Segmentation
 
@@ -36,8 +36,10 @@ _FLATNESS = 0.25
 _CHORD = 0.5
 # An edge point joins a patch whose plane is this near: in smallest cells, plus three noises.
 _JOIN_CELLS = 0.25
-# A patch has inner cells of this area, in smallest cells.
-_CORE_CELLS = 4.0
+# A group is no patch when larger ones explain this share of its points.
+_CLAIMED = 0.5
+# A point of a bend lies on a plane when it is this near.
+_LIE_CELLS = 0.05
 # A cell on a bend joins a face whose normal is this many tolerances away at most.
 _BEND_TOLERANCES = 2.0
 
@@ -244,39 +246,45 @@ def grow_regions(
     takes_part = np.zeros(grid.count, bool)
     takes_part[leaves[edge == int(EdgeClass.NONE)]] = True
     group = flood_fill(grid, takes_part, **rule)
-    bend = np.zeros(grid.count, bool)
-    if not literal:
-        whole = group
-        group = split_at_bends(
-            grid,
-            whole,
-            min_points=params.regions.min_points,
-            flat=params.grid.tolerance,
-            noise=measured.normal_noise,
-            **rule,
-        )
-        bend = (group < 0) & (whole >= 0)
-    finest = grid.size / 2.0**grid.depth
-    size = {
-        "min_points": params.regions.min_points,
-        "min_core": 0.0 if literal else _CORE_CELLS * finest**2,
-    }
-    cell_label = number_groups(grid, group, **size)
-    if not params.regions.assign_edges:
+    min_points = params.regions.min_points
+    if literal or not params.regions.assign_edges:
+        cell_label = number_groups(grid, group, min_points)
         return cell_label, points_of_leaves(grid, leaves, cell_label[leaves])
+    whole = group
+    group = split_at_bends(
+        grid,
+        whole,
+        min_points=min_points,
+        flat=params.grid.tolerance,
+        noise=measured.normal_noise,
+        **rule,
+    )
+    bend = (group < 0) & (whole >= 0)
+    finest = grid.size / 2.0**grid.depth
     fit = {
-        "bend": bend,
         "reach": finest,
         "limit": _JOIN_CELLS * finest + 3.0 * measured.noise,
+        "tight": _LIE_CELLS * finest + 3.0 * measured.noise,
         "angle": _BEND_TOLERANCES * params.grid.tolerance,
     }
-    label = assign_points(grid, leaves, cell_label, **fit)
-    if bend.any():
-        # What no face claims of the bends is a surface of its own.
-        bend = unclaimed_cells(grid, leaves, label, bend)
-        group = np.where(bend, flood_fill(grid, bend, **rule), group)
-        cell_label = number_groups(grid, group, **size)
-        label = assign_points(grid, leaves, cell_label, **fit)
+    # Groups that larger ones explain are no patches: strips along an edge, and bends that are as
+    # flat as the face beside them. What is left of them stands for itself.
+    group[bend] = flood_fill(grid, bend, **rule)[bend]
+    number = number_groups(grid, group, min_points)
+    doubtful = (strips(grid, group) | bend) & (number >= 0)
+    cell_label = np.where(doubtful, NONE, number)
+    label = assign_points(grid, leaves, cell_label, bend=bend, **fit)
+    if doubtful.any():
+        claimed = claimed_share(grid, leaves, label, np.where(doubtful, number, NONE))
+        dropped = np.append(claimed > _CLAIMED, True)
+        group[doubtful & dropped[number]] = NONE
+        bends = np.flatnonzero(bend & (group >= 0))
+        cells = np.full(grid.count, NONE, np.int32)
+        cells[bends] = np.arange(len(bends), dtype=np.int32)
+        flush = bends[claimed_share(grid, leaves, label, cells) > _CLAIMED]
+        group[flush] = NONE
+        cell_label = number_groups(grid, group, min_points)
+        label = assign_points(grid, leaves, cell_label, bend=bend, **fit)
     return cell_label, label
 
 

@@ -18,9 +18,7 @@ _ROUNDS = 3
 
 @ti.kernel
 def _join(
-    reach: ti.f64,
-    limit: ti.f64,
-    cosine: ti.f64,
+    rule: ti.types.vector(4, ti.f64),
     finest: ti.f64,
     depth: ti.i32,
     shape: ti.types.vector(3, ti.i32),
@@ -34,16 +32,20 @@ def _join(
     # Out:
     label_inout: I32Array,
 ):
-    """Give points without a label that of the nearest mean plane among the cells at a distance."""
+    """Give points without a label that of the nearest mean plane among the cells at a distance.
+
+    The rule holds the reach, the largest distance from the plane, that distance on a bend where the
+    normals differ, and the cosine from which they do not.
+    """
     for t in range(todo_in.shape[0]):
         i = todo_in[t, 0]
         bend = todo_in[t, 1]
         p = row(point_in, i)
-        best = limit
+        best = rule[1]
         chosen = -1
         nearest = 0.0
         for o in range(27):
-            q = p + reach * vec3(o // 9 - 1, (o // 3) % 3 - 1, o % 3 - 1)
+            q = p + rule[0] * vec3(o // 9 - 1, (o // 3) % 3 - 1, o % 3 - 1)
             x = ti.cast(ti.floor(q[0] * finest), ti.i32)
             y = ti.cast(ti.floor(q[1] * finest), ti.i32)
             z = ti.cast(ti.floor(q[2] * finest), ti.i32)
@@ -52,8 +54,9 @@ def _join(
                 d = p - vec3(mean_in[c, POINT], mean_in[c, POINT + 1], mean_in[c, POINT + 2])
                 off = ti.abs(d.dot(row(mean_in, c)))
                 far = d.norm()
-                if bend >= 0 and ti.abs(row(mean_in, bend).dot(row(mean_in, c))) < cosine:
-                    off = limit
+                if bend >= 0 and off > rule[2]:
+                    if ti.abs(row(mean_in, bend).dot(row(mean_in, c))) < rule[3]:
+                        off = rule[1]
                 # Ties go to the nearer cell, then to the smaller label: never to the order.
                 if off < best or (off == best and chosen >= 0 and far < nearest):
                     best = off
@@ -86,6 +89,7 @@ def assign_points(
     bend: np.ndarray,
     reach: float,
     limit: float,
+    tight: float,
     angle: float,
 ) -> np.ndarray:
     """Give the points without a label to the patch whose surface they lie on.
@@ -94,9 +98,11 @@ def assign_points(
         grid: The sparse grid.
         leaves: The nodes that are leaves, in Morton order, shape (C,).
         cell_label: Label of every node, -1 for edge cells and for those of no patch, shape (M,), i32.
-        bend: Nodes on a bend, shape (M,), bool: their normals are good, so they must agree too.
+        bend: Nodes on a bend, shape (M,), bool. Their points join a patch when they lie on its plane,
+            or when they are near it and its normal agrees with that of their cell.
         reach: How far to look in the first round [mm], about the smallest cell.
         limit: Largest distance of a point from the mean plane of the cell whose patch it joins [mm].
+        tight: Largest distance from the plane on a bend where the normals do not agree [mm].
         angle: Largest angle between the normals of a bend and of the cell whose patch it joins [rad].
 
     Returns:
@@ -114,9 +120,7 @@ def assign_points(
             break
         device_label = runtime.upload(label)
         _join(
-            r * reach,
-            limit,
-            float(np.cos(angle)),
+            ti.Vector([r * reach, limit, tight, float(np.cos(angle))]),
             2.0**grid.depth / grid.size,
             grid.depth,
             ti.Vector(grid.shape),
@@ -132,20 +136,22 @@ def assign_points(
     return label
 
 
-def unclaimed_cells(grid: Grid, leaves: np.ndarray, label: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Say which nodes kept most of their points without a label.
+def claimed_share(
+    grid: Grid, leaves: np.ndarray, label: np.ndarray, group: np.ndarray
+) -> np.ndarray:
+    """Return the share of the points of every group that got a label.
 
     Args:
         grid: The sparse grid.
         leaves: The nodes that are leaves, in Morton order, shape (C,).
         label: Label of every sorted point, shape (n,), i32.
-        nodes: The nodes in question, shape (M,), bool.
+        group: Number of the group of every node, 0..G-1, -1 = none, shape (M,), i32.
 
     Returns:
-        Nodes in question whose points are mostly unlabelled, shape (M,), bool.
+        Share of labelled points, 0 for an empty group, shape (G,), f64.
     """
-    node = runtime.download(grid.node)
-    free = np.add.reduceat((label < 0).astype(np.int32), node[leaves, LO])
-    mostly = np.zeros(grid.count, bool)
-    mostly[leaves] = 2 * free > node[leaves, HI] - node[leaves, LO]
-    return mostly & nodes
+    of_point = points_of_leaves(grid, leaves, group[leaves])
+    groups = int(group.max(initial=NONE)) + 1
+    total = np.bincount(of_point[of_point >= 0], minlength=groups)
+    labelled = np.bincount(of_point[(of_point >= 0) & (label >= 0)], minlength=groups)
+    return labelled / np.maximum(total, 1)

@@ -2,28 +2,33 @@
 
 A bend that is wider than the smallest cell leaves a chain of agreeing cells, through which the flood
 passes from face to face. The paper's remedy is to remove the smallest cells by hand until the faces
-come apart (section 3.4). Here each region is tried with every number of smallest sizes removed, and
-the cut is accepted when the turning of the normals is concentrated in what was removed: every face
-is flat compared with the angle to its nearest sister. A surface of even curvature never passes: the
-sizes of its cells alternate with its direction in the grid, so that pieces that turn by t are left
-with gaps of t between them; such a piece has the deviation t / sqrt(12), and its sister stands at
-the angle 2 t: a ratio of 0.14.
+come apart (section 3.4). Here the turning of the normals from cell to cell tells where a region
+bends; it is tried with several limits of that turning, and a cut is accepted when the turning is
+concentrated in what was removed: every face is flat compared with the angle to its nearest sister. A
+surface of even curvature never passes: removing any half of it leaves pieces that turn by t with
+gaps of t between them; such a piece has the deviation t / sqrt(12), and its sister stands at the
+angle 2 t: a ratio of 0.14.
 """
 
 import numpy as np
 
 from octoseg_ti.device import runtime
-from octoseg_ti.stages.grid import Grid
-from octoseg_ti.stages.moments import HI, LEVEL, LO, NORMAL
+from octoseg_ti.device.linalg import row, vec3
+from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, I64Rows, ti
+from octoseg_ti.stages.grid import Grid, find_node
+from octoseg_ti.stages.moments import HI, LEVEL, LO, NORMAL, POINT, X, Y, Z
 from octoseg_ti.stages.regions import flood_fill
 from octoseg_ti.types import NONE
 
+# Turning over one smallest cell [rad] above which a cell counts as bent, coarse to fine.
+_TURNS = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035)
+_ONE = 1048576.0  # 2^20
 # Well below the 0.14 of an evenly curved surface.
 _FLAT = 0.08
 # The faces must hold most of the region: else it is a curved surface with flat spots.
 _COVERAGE = 0.6
-# ... and most of what the faces hold must be flat, so that a face may still be cut further.
-_FLAT_SHARE = 0.8
+# ... and so much of what the faces hold must be flat; the rest may be cut further.
+_FLAT_SHARE = 0.4
 # Faces at a smaller angle are not told apart [rad].
 _LEAST_ANGLE = 0.1
 
@@ -74,6 +79,81 @@ def _faces_are_flat(
     return flat.sum() >= 2 and bool(size[flat].sum() >= _FLAT_SHARE * size.sum())
 
 
+@ti.kernel
+def _sum_turns(
+    depth: ti.i32,
+    variance: ti.f64,
+    finest: ti.f64,
+    shape: ti.types.vector(3, ti.i32),
+    # In:
+    node_in: I32Rows,
+    child_in: I32Rows,
+    root_in: I32Array,
+    mean_in: F64Rows,
+    group_in: I32Array,
+    # Out:
+    sum_inout: I64Rows,
+):
+    """Add up, for every cell, squared turning and squared distance to the touching cells of its group."""
+    for c in group_in:
+        if group_in[c] >= 0:
+            level = node_in[c, LEVEL]
+            for o in range(27):
+                x = node_in[c, X] + o // 9 - 1
+                y = node_in[c, Y] + (o // 3) % 3 - 1
+                z = node_in[c, Z] + o % 3 - 1
+                b = find_node(x, y, z, level, shape, depth, root_in, child_in)
+                if b >= 0 and b < c and group_in[b] == group_in[c]:
+                    n = row(mean_in, c)
+                    m = row(mean_in, b)
+                    if n.dot(m) < 0.0:
+                        m = -m
+                    d = vec3(
+                        mean_in[b, POINT] - mean_in[c, POINT],
+                        mean_in[b, POINT + 1] - mean_in[c, POINT + 1],
+                        mean_in[b, POINT + 2] - mean_in[c, POINT + 2],
+                    )
+                    count = 1.0 / (node_in[c, HI] - node_in[c, LO])
+                    count += 1.0 / (node_in[b, HI] - node_in[b, LO])
+                    # What the noise of the mean normals adds is taken off, also where that leaves
+                    # less than nothing: the sum over the pairs is right.
+                    turn = ti.cast(ti.round(((n - m).norm_sqr() - variance * count) * _ONE), ti.i64)
+                    far = ti.cast(ti.round(d.norm_sqr() / (finest * finest) * _ONE), ti.i64)
+                    ti.atomic_add(sum_inout[c, 0], turn)
+                    ti.atomic_add(sum_inout[c, 1], far)
+                    ti.atomic_add(sum_inout[b, 0], turn)
+                    ti.atomic_add(sum_inout[b, 1], far)
+
+
+def turning(grid: Grid, group: np.ndarray, noise: float) -> np.ndarray:
+    """Return how far the normal turns over one smallest cell, around every cell of a group.
+
+    Args:
+        grid: The sparse grid.
+        group: Group of every node, -1 = none, shape (M,), i32.
+        noise: Deviation of the normals that is noise [rad].
+
+    Returns:
+        Root mean square turning [rad], shape (M,); 0 for cells without a neighbour in their group.
+    """
+    runtime.ensure_started()
+    sums = runtime.zeros((grid.count, 2), np.int64)
+    _sum_turns(
+        grid.depth,
+        noise**2,
+        grid.size / 2.0**grid.depth,
+        ti.Vector(grid.shape),
+        grid.node,
+        grid.child,
+        grid.root,
+        grid.mean,
+        runtime.upload(group),
+        sums,
+    )
+    turn, far = runtime.download(sums).T.astype(np.float64)
+    return np.sqrt(np.maximum(turn, 0.0) / np.maximum(far, 1.0))
+
+
 def split_at_bends(
     grid: Grid,
     group: np.ndarray,
@@ -103,47 +183,62 @@ def split_at_bends(
     node = runtime.download(grid.node)[: grid.count]
     mean = runtime.download(grid.mean)[: grid.count]
     count = node[:, HI] - node[:, LO]
-    inside = np.flatnonzero(group >= 0)
-    size = np.bincount(group[inside], weights=count[inside], minlength=grid.count)
-    sums = np.stack(
-        [
-            np.bincount(
-                group[inside], weights=count[inside] * mean[inside, NORMAL + k], minlength=grid.count
-            )
-            for k in range(3)
-        ],
-        axis=1,
-    )
-    length = np.linalg.norm(sums, axis=1) / np.maximum(size, 1)
-    suspect = (size >= 2 * min_points) & (length < np.cos(flat))
     result = group.copy()
-    takes_part = np.zeros(grid.count, bool)
-    takes_part[inside] = suspect[group[inside]]
-    while takes_part.any():
-        # Remove the smallest size that is left of every suspect.
-        part = np.flatnonzero(takes_part)
-        finest = np.zeros(grid.count, np.int32)
-        np.maximum.at(finest, result[part], node[part, LEVEL])
-        takes_part[part] = node[part, LEVEL] < finest[result[part]]
-        if not takes_part.any():
-            break
+    suspects = _suspects(group, count, mean[:, NORMAL : NORMAL + 3], 2 * min_points, flat)
+    if not suspects:
+        return result
+    turn = turning(grid, group, noise)
+    tried: dict[int, int] = {}
+    for limit in _TURNS:
+        straight = {}
+        for name, cells in suspects.items():
+            kept = turn[cells] <= limit
+            points = count[cells[kept]].sum()
+            if not kept.all() and points >= _COVERAGE * count[cells].sum():
+                if tried.get(name) != points:
+                    straight[name] = cells[kept]
+                tried[name] = points
+        if not straight:
+            continue
+        takes_part = np.zeros(grid.count, bool)
+        takes_part[np.concatenate(list(straight.values()))] = True
         pieces = flood_fill(grid, takes_part, homogeneity=homogeneity, chord=chord, slack=slack)
-        in_piece = np.flatnonzero(pieces >= 0)
-        points = np.bincount(pieces[in_piece], weights=count[in_piece], minlength=grid.count)
-        pieces[in_piece] = np.where(points[pieces[in_piece]] >= min_points, pieces[in_piece], NONE)
-        for name in np.unique(result[part]):
-            cells = np.flatnonzero(result == name)
+        inside = np.flatnonzero(pieces >= 0)
+        points = np.bincount(pieces[inside], weights=count[inside], minlength=grid.count)
+        pieces[inside] = np.where(points[pieces[inside]] >= min_points, pieces[inside], NONE)
+        for name in straight:
+            cells = suspects[name]
             names, numbered = np.unique(pieces[cells], return_inverse=True)
-            numbered = numbered - int(names[0] == NONE)
-            normal = mean[cells, NORMAL : NORMAL + 3]
             if _faces_are_flat(
-                numbered,
+                numbered - int(names[0] == NONE),
                 count[cells],
-                normal,
+                mean[cells, NORMAL : NORMAL + 3],
                 noise=noise,
                 least_angle=max(_LEAST_ANGLE, 2.0 * flat),
                 signed=grid.signed,
             ):
                 result[cells] = pieces[cells]
-                takes_part[cells] &= pieces[cells] >= 0
+                del suspects[name]
+                normals = mean[cells, NORMAL : NORMAL + 3]
+                again = _suspects(pieces[cells], count[cells], normals, 2 * min_points, flat)
+                suspects.update({piece: cells[part] for piece, part in again.items()})
     return result
+
+
+def _suspects(
+    group: np.ndarray, count: np.ndarray, normal: np.ndarray, min_points: int, flat: float
+) -> dict[int, np.ndarray]:
+    """Return the cells of every group that is large and not flat, by the name of the group."""
+    inside = np.flatnonzero(group >= 0)
+    order = inside[np.argsort(group[inside], kind="stable")]
+    names, first = np.unique(group[order], return_index=True)
+    found = {}
+    for name, cells in zip(names, np.split(order, first[1:]), strict=True):
+        size = count[cells].sum()
+        # Axes, not directions: without sides a mean of directions means nothing.
+        weighted = normal[cells] * count[cells, None]
+        if size >= min_points:
+            largest = np.linalg.eigvalsh(weighted.T @ normal[cells])[-1] / size
+            if 1.0 - largest > flat**2:
+                found[int(name)] = cells
+    return found

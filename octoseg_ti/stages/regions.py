@@ -14,6 +14,9 @@ from octoseg_ti.stages.grid import Grid, find_node
 from octoseg_ti.stages.moments import HI, LEVEL, LO, POINT, X, Y, Z
 from octoseg_ti.types import NONE
 
+# A face has at least this share of its area in cells that touch no larger face.
+_CORE = 0.5
+
 
 @ti.func
 def _agree(
@@ -187,33 +190,48 @@ def inner_cells(grid: Grid, group: np.ndarray, size: np.ndarray) -> np.ndarray:
     return (group >= 0) & (runtime.download(border) == 0)
 
 
-def number_groups(
-    grid: Grid, group: np.ndarray, min_points: int, min_core: float = 0.0
-) -> np.ndarray:
-    """Number the groups by size, largest first; groups too small for a patch get -1.
+def number_groups(grid: Grid, group: np.ndarray, min_points: int) -> np.ndarray:
+    """Number the groups by size, largest first; small groups get -1.
 
     Args:
         grid: The sparse grid.
         group: Group of every node, named by its first node, -1 = none, shape (M,), i32.
         min_points: A group with fewer points is no patch.
-        min_core: A patch has inner cells (touching no larger group) of this area [mm^2]; what
-            has none is a strip along an edge, where the normals of two faces were averaged.
 
     Returns:
         Label of every node, shape (M,), i32. Groups of equal size are ordered by their first node,
         which depends on where they are, not on the order of the points.
     """
-    node = runtime.download(grid.node)[: grid.count]
-    count = node[:, HI] - node[:, LO]
-    inside = group >= 0
-    size = np.bincount(group[inside], weights=count[inside], minlength=grid.count)
-    kept = size >= max(1, min_points)
-    if min_core > 0.0:
-        inner = inner_cells(grid, group, size)
-        area = (grid.size / 2.0 ** node[inner, LEVEL]) ** 2
-        kept &= np.bincount(group[inner], weights=area, minlength=grid.count) >= min_core
-    names = np.flatnonzero(kept)
+    size = group_sizes(grid, group)
+    names = np.flatnonzero(size >= max(1, min_points))
     names = names[np.argsort(-size[names], kind="stable")]
     label = np.full(grid.count + 1, NONE, np.int32)
     label[names] = np.arange(len(names), dtype=np.int32)
-    return label[np.where(inside, group, grid.count)]
+    return label[np.where(group >= 0, group, grid.count)]
+
+
+def group_sizes(grid: Grid, group: np.ndarray) -> np.ndarray:
+    """Return the points of every group, by its name, shape (M,), f64 (whole numbers)."""
+    node = runtime.download(grid.node)[: grid.count]
+    inside = group >= 0
+    count = node[inside, HI] - node[inside, LO]
+    return np.bincount(group[inside], weights=count, minlength=grid.count)
+
+
+def strips(grid: Grid, group: np.ndarray) -> np.ndarray:
+    """Return the nodes of groups that may be strips along a larger one, shape (M,), bool.
+
+    Along an edge the normals of two faces are averaged; cells that hold only such points agree with
+    each other and form a group of their own. Nearly all its cells touch a larger group.
+
+    Args:
+        grid: The sparse grid.
+        group: Group of every node, named by its first node, -1 = none, shape (M,), i32.
+    """
+    node = runtime.download(grid.node)[: grid.count]
+    inner = inner_cells(grid, group, group_sizes(grid, group))
+    area = (grid.size / 2.0 ** node[:, LEVEL]) ** 2
+    inside = group >= 0
+    whole = np.bincount(group[inside], weights=area[inside], minlength=grid.count)
+    core = np.bincount(group[inner], weights=area[inner], minlength=grid.count)
+    return inside & (core < _CORE * whole)[np.where(inside, group, 0)]
