@@ -72,7 +72,9 @@ def read(path: str | Path, *, unit: Unit | None = None, topic: str | None = None
         if unit is not None and unit != ("m" if suffix == ".mcap" else "mm"):
             what = f"a {suffix} file has a fixed unit"
             raise DataError(what, path=path, hint="leave the unit out")
-        return module.read_scans(path, topic=topic) if suffix == ".mcap" else module.read_scans(path)
+        return (
+            module.read_scans(path, topic=topic) if suffix == ".mcap" else module.read_scans(path)
+        )
     return module.read_scans(path, unit=unit)
 
 

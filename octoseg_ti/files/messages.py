@@ -5,6 +5,7 @@ Recordings are in metres. Numbers of fields are never reused: new fields come at
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,6 +14,7 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
@@ -31,6 +33,9 @@ _KINDS = {
     "f4": PackedElementField.FLOAT32,
     "f8": PackedElementField.FLOAT64,
 }
+CUBE_ALPHA = 0.35
+"""Opacity of the cubes of a grid, so that the points inside are seen."""
+
 _CODES = {int(kind): code for code, kind in _KINDS.items()}
 
 PARAMS_FIELDS = (
@@ -203,20 +208,33 @@ def cubes_message(
     message = SceneUpdate()
     entity = message.entities.add(id=identity, frame_id="world")
     entity.timestamp.seconds, entity.timestamp.nanos = divmod(time_ns, 1_000_000_000)
-    center = ((corner + 0.5 * size[:, None]) / METRE).tolist()
-    edge = (size / METRE).tolist()
-    shade = (color / 255.0).tolist()
-    add = entity.cubes.add
-    for (x, y, z), s, (r, g, b, _) in zip(center, edge, shade, strict=True):
-        cube = add()
-        position = cube.pose.position
-        position.x, position.y, position.z = x, y, z
-        cube.pose.orientation.w = 1.0
-        extent = cube.size
-        extent.x = extent.y = extent.z = s
-        paint = cube.color
-        paint.r, paint.g, paint.b, paint.a = r, g, b, 0.35
+    template, places = _cube_template()
+    rows = np.tile(np.frombuffer(template, np.uint8), (len(size), 1))
+    center = (corner + 0.5 * size[:, None]) / METRE
+    values = [*center.T, *np.tile(size / METRE, (3, 1)), *(color[:, :3].T / 255.0)]
+    values.append(np.full(len(size), CUBE_ALPHA))
+    for place, value in zip(places, values, strict=True):
+        rows[:, place : place + 8] = value.astype("<f8").view(np.uint8).reshape(-1, 8)
+    entity.MergeFromString(rows.tobytes())
     return message
+
+
+def _cube_template() -> tuple[bytes, list[int]]:
+    """Return an entity of one cube as bytes, and where its ten numbers are.
+
+    Protobuf itself writes the bytes; filling in the numbers of all cubes at once and letting
+    protobuf parse them is an order of magnitude faster than setting ten attributes per cube.
+    """
+    marks = [float(np.sqrt(2.0 + k)) for k in range(10) if k not in (2, 7)] + [0.1, 0.2]
+    entity = SceneEntity()
+    cube = entity.cubes.add()
+    position, extent, paint = cube.pose.position, cube.size, cube.color
+    position.x, position.y, position.z = marks[:3]
+    extent.x, extent.y, extent.z = marks[3:6]
+    paint.r, paint.g, paint.b, paint.a = marks[6:]
+    cube.pose.orientation.w = 1.0
+    template = entity.SerializeToString()
+    return template, [template.index(struct.pack("<d", mark)) for mark in marks]
 
 
 def log_message(text: str, time_ns: int, level: int = Log.INFO) -> Log:

@@ -101,7 +101,9 @@ def read_segmentation(path: str | Path) -> Segmentation:
     """
     arrays = load(path)
     if _content(arrays) != "segmentation":
-        raise DataError("this file holds no result", path=path, hint="make one with `octoseg segment`")
+        raise DataError(
+            "this file holds no result", path=path, hint="make one with `octoseg segment`"
+        )
     with parsing(path, "NPZ", _HINT):
         return archives.result_from_arrays(arrays)
 

@@ -37,7 +37,9 @@ def write_recording(
     Raises:
         DataError: The output cannot be written; nothing is left behind.
     """
-    name = scans.name if scans is not None else segmentation.name if segmentation is not None else ""
+    name = (
+        scans.name if scans is not None else segmentation.name if segmentation is not None else ""
+    )
     with RecordingWriter(path, name=name, run=run, overwrite=overwrite) as writer:
         if segmentation is not None:
             add_params(writer, segmentation)

@@ -10,7 +10,7 @@ from typing import IO, Any
 
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Chunk, Message
+from mcap.records import Channel, Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from octoseg_ti.errors import DataError
@@ -121,7 +121,7 @@ def _readable_stripes(path: Path) -> int:
                 for inner in breakup_chunk(record, validate_crc=True):
                     if isinstance(inner, Message):
                         count += topics.get(inner.channel_id) == "/scan/lines"
-                    elif hasattr(inner, "topic"):
+                    elif isinstance(inner, Channel):
                         topics[inner.id] = inner.topic
         except (McapError, ValueError, struct.error, zlib.error, MemoryError, RuntimeError):
             pass  # this is the damage

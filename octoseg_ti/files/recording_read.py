@@ -15,6 +15,7 @@ from octoseg_ti.files import archives, messages
 from octoseg_ti.files.messages import METRE
 from octoseg_ti.files.poses import moved, pose
 from octoseg_ti.files.recording_check import BROKEN, records, verify
+from octoseg_ti.files.recording_rows import positions
 from octoseg_ti.files.validation import make_scans, make_truth, parsing
 from octoseg_ti.types import Scans, Segmentation, Truth
 
@@ -122,9 +123,9 @@ def read_truth(path: str | Path) -> Truth | None:
     attachment = contents.attachments.get("ground_truth.npz")
     if attachment is None:
         return None
-    channel = _cloud_channel(contents, None)
+    _cloud_channel(contents, None)
     with parsing(path, "MCAP", BROKEN):
-        points = _positions(_rows(contents.messages)[0])
+        points = positions(_rows(contents.messages)[0])
         values = archives.unpack_truth(attachment.data, points)
         return make_truth(path, values, len(points))
 
@@ -148,7 +149,7 @@ def read_segmentation(path: str | Path) -> Segmentation:
         for name, column in names.items():
             if column in (rows.dtype.names or ()):
                 arrays[name] = rows[column]
-        arrays["points"] = _positions(rows)
+        arrays["points"] = positions(rows)
         arrays["normals"] = np.stack([rows[f"normal_{axis}"] for axis in "xyz"], axis=1)
         return archives.result_from_arrays(arrays)
 
@@ -198,17 +199,12 @@ def _rows(mine: list[Message]) -> tuple[np.ndarray, np.ndarray]:
     return np.frombuffer(b"".join(data), dtype), np.array(lengths)
 
 
-def _positions(rows: np.ndarray) -> np.ndarray:
-    """Return positions [mm], shape (N, 3), f64."""
-    return np.stack([rows[name].astype(np.float64) for name in "xyz"], axis=1) * METRE
-
-
 def _own_scans(contents: Contents, channel: Channel, mine: list[Message]) -> dict[str, Any]:
     """Return the fields of `Scans` of a recording of ours."""
     rows, lengths = _rows(mine)
     run = contents.metadata["octoseg.run"]
     names = rows.dtype.names or ()
-    values: dict[str, Any] = {"points": _positions(rows), "name": run.get("name", "")}
+    values: dict[str, Any] = {"points": positions(rows), "name": run.get("name", "")}
     if "normal_x" in names:
         values["normals"] = np.stack([rows[f"normal_{axis}"] for axis in "xyz"], axis=1)
     for name in ("column", "view"):
@@ -220,7 +216,10 @@ def _own_scans(contents: Contents, channel: Channel, mine: list[Message]) -> dic
         start = int(run.get("start_ns", "0"))
         values["time_ns"] = np.repeat([message.log_time - start for message in mine], lengths)
     if "scan.npz" in contents.attachments:
-        values |= archives.unpack(contents.attachments["scan.npz"].data)
+        exact = archives.unpack(contents.attachments["scan.npz"].data)
+        if "time_step_ns" in exact:
+            values["time_ns"] = np.cumsum(exact.pop("time_step_ns"))
+        values |= exact
     return values
 
 
@@ -244,7 +243,7 @@ def _foreign_scans(contents: Contents, channel: Channel) -> dict[str, Any]:
         matrix = _to_root(parents, cloud.frame_id)
         if cloud.HasField("pose"):
             matrix = matrix @ _pose_of(cloud.pose.position, cloud.pose.orientation)
-        xyz = _positions(rows)
+        xyz = positions(rows)
         identity = np.array_equal(matrix, np.eye(4))
         points.append(xyz if identity else moved(matrix, xyz))
         times.append(message.log_time)

@@ -10,14 +10,14 @@ import numpy as np
 
 from octoseg_ti.files import archives, messages
 from octoseg_ti.files.messages import METRE
-from octoseg_ti.files.recording_write import (
-    _NORMAL,
-    _RGBA,
-    RecordingWriter,
+from octoseg_ti.files.recording_rows import (
+    NORMAL,
+    RGBA,
     needs_double,
     put_colors,
     put_columns,
 )
+from octoseg_ti.files.recording_write import RecordingWriter
 from octoseg_ti.palette import colors, level_colors, normal_colors
 from octoseg_ti.types import Cells, EdgeClass, Segmentation
 
@@ -68,7 +68,9 @@ def add_result(
     _add_cells(writer, result.cells, time)
     _add_figures(writer, result, time)
     writer.attach(
-        "result.npz", "application/zip", archives.pack(archives.result_arrays(result, per_point=False))
+        "result.npz",
+        "application/zip",
+        archives.pack(archives.result_arrays(result, per_point=False)),
     )
     if report is not None:
         writer.attach("report.md", "text/markdown", report.encode())
@@ -95,7 +97,11 @@ def initial_cells(cells: Cells) -> tuple[np.ndarray, int]:
     whole = np.flatnonzero(cells.level == 0)
     origin = cells.corner[whole[0]] if len(whole) else cells.corner.min(axis=0)
     middle = cells.corner + 0.5 * cells.size[:, None]
-    index = np.unique(np.floor((middle - origin) / side).astype(np.int64), axis=0)
+    index = np.floor((middle - origin) / side).astype(np.int64)
+    low = index.min(axis=0)
+    counts = index.max(axis=0) - low + 1
+    keys = np.unique(np.ravel_multi_index(tuple((index - low).T), tuple(counts)))
+    index = np.stack(np.unravel_index(keys, tuple(counts)), axis=1) + low
     return origin + index * side, int(len(whole) == 0)
 
 
@@ -103,10 +109,10 @@ def _segment_rows(result: Segmentation, column: np.ndarray | None) -> np.ndarray
     """Return the rows of /segments/points: everything that a point has, at full resolution."""
     position = "<f8" if needs_double(result.points) else "<f4"
     fields = [("x", position), ("y", position), ("z", position)]
-    fields += [("label", "<i4"), *_NORMAL]
+    fields += [("label", "<i4"), *NORMAL]
     extra = {"line": result.stripe, "column": column, "view": result.view}
     fields += [(name, "<i4") for name, value in extra.items() if value is not None]
-    fields += [("edge", "u1"), ("level", "i1"), ("outlier", "u1"), *_RGBA]
+    fields += [("edge", "u1"), ("level", "i1"), ("outlier", "u1"), *RGBA]
     rows = np.empty(len(result), np.dtype(fields))
     put_columns(rows, "xyz", result.points / METRE)
     put_columns(rows, ("normal_x", "normal_y", "normal_z"), result.normals)
@@ -143,7 +149,7 @@ def _picked(rows: np.ndarray, names: list[str], index: np.ndarray) -> np.ndarray
     """Return some fields of some rows, with room for colours, packed."""
     assert rows.dtype.fields is not None
     fields = [(name, rows.dtype.fields[name][0].str) for name in names]
-    picked = np.empty(len(index), np.dtype(fields + _RGBA))
+    picked = np.empty(len(index), np.dtype(fields + RGBA))
     for name in names:
         picked[name] = rows[name][index]
     return picked
@@ -153,7 +159,7 @@ def _add_cells(writer: RecordingWriter, cells: Cells, time: int) -> None:
     """Write the grid as points with a size, and, while it is not too large, as cubes."""
     position = "<f8" if needs_double(cells.corner) else "<f4"
     fields = [("x", position), ("y", position), ("z", position), ("size", position)]
-    fields += [("level", "u1"), ("count", "<u4"), ("label", "<i4"), ("edge", "u1"), *_RGBA]
+    fields += [("level", "u1"), ("count", "<u4"), ("label", "<i4"), ("edge", "u1"), *RGBA]
     rows = np.empty(len(cells), np.dtype(fields))
     put_columns(rows, "xyz", (cells.corner + 0.5 * cells.size[:, None]) / METRE)
     rows["size"] = cells.size / METRE
@@ -203,9 +209,7 @@ def _add_figures(writer: RecordingWriter, result: Segmentation, time: int) -> No
     start = 0
     for number, (name, seconds) in enumerate(result.seconds.items()):
         duration = round(seconds * 1e9)
-        stage = messages.Stage(
-            name=name, start_ns=start, duration_ns=duration, points=len(result)
-        )
+        stage = messages.Stage(name=name, start_ns=start, duration_ns=duration, points=len(result))
         writer.write("/profile/stages", stage.SerializeToString(), time, number)
         start += duration
     text = f"{len(result)} points in {len(result.cells)} cells: {result.patch_count} patches"

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -19,27 +19,27 @@ from octoseg_ti import __version__
 from octoseg_ti.errors import DataError
 from octoseg_ti.files import archives, messages
 from octoseg_ti.files.atomic import AtomicFile
-from octoseg_ti.files.messages import METRE, CloudLayout
-from octoseg_ti.files.poses import moved
+from octoseg_ti.files.messages import CloudLayout
+from octoseg_ti.files.recording_rows import (
+    in_world,
+    joined,
+    needs_double,
+    positions,
+    scan_rows,
+    truth_rows,
+)
 from octoseg_ti.files.validation import runs
-from octoseg_ti.palette import SCAN_COLOR, colors
 from octoseg_ti.types import Scans, Truth
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 LIBRARY = f"octoseg {__version__}"
 START_NS = 1_767_225_600_000_000_000
 """Time stamp of time 0: 2026-01-01T00:00:00Z. Fixed, so that equal input gives equal bytes."""
 
-RESOLUTION_MM = 1e-3
-"""Single-precision metres are used while they keep positions to 1 um."""
-
-ERROR_STEP_MM = 1e-4
-"""Unit of the field ``error_100nm`` of ``/truth/lines``."""
-
 _NOMINAL_STEP_NS = 1_000_000  # a stripe without a time gets its turn, one millisecond each
 _BLOCK = 50_000  # points of a message when there are no stripes
-
-_RGBA = [("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1")]
-_NORMAL = [("normal_x", "<f4"), ("normal_y", "<f4"), ("normal_z", "<f4")]
 
 
 class RecordingWriter:
@@ -112,7 +112,7 @@ class RecordingWriter:
             self.abort()
             raise
 
-    def __enter__(self) -> RecordingWriter:
+    def __enter__(self) -> Self:
         """Return the writer."""
         return self
 
@@ -177,7 +177,14 @@ class RecordingWriter:
         """
         form = tuple(
             value is not None
-            for value in (scans.stripe, scans.normals, scans.column, scans.view, scans.time_ns, truth)
+            for value in (
+                scans.stripe,
+                scans.normals,
+                scans.column,
+                scans.view,
+                scans.time_ns,
+                truth,
+            )
         )
         if self._form is None:
             self._form = form
@@ -186,13 +193,13 @@ class RecordingWriter:
         if len(scans) == 0:
             return
         self._extras.update(archives.scan_extras(scans))
-        points, normals = _in_world(scans)
-        rows, stored = self._scan_rows(scans, points, normals)
-        truth_rows = None
+        points, normals = in_world(scans)
+        rows = scan_rows(scans, points, normals, truth, self._position_type(points))
+        truth_part = None
         if truth is not None:
-            truth_rows = _truth_rows(truth, rows, points)
+            truth_part = truth_rows(truth, rows, points)
             self._truth.append(truth)
-            self._points.append(stored)
+            self._points.append(positions(rows))
         if scans.stripe is None:
             bounds = np.append(np.arange(0, len(points), _BLOCK), len(points))
         else:
@@ -204,17 +211,17 @@ class RecordingWriter:
         views = [0] * len(first) if scans.view is None else scans.view[first].tolist()
         scan_layout = self._layout("/scan/lines", rows.dtype, self._scan_notes(scans))
         truth_layout = None
-        if truth_rows is not None:
+        if truth_part is not None:
             notes = {"error_100nm": "distance from the true surface along its normal, 0.1 um"}
-            truth_layout = self._layout("/truth/lines", truth_rows.dtype, notes)
+            truth_layout = self._layout("/truth/lines", truth_part.dtype, notes)
         for a, b, number, view, time in zip(
             first.tolist(), bounds[1:].tolist(), numbers, views, times, strict=True
         ):
             stamp = self.start_ns + time
             self._tell_poses(number, view, time)
             self.write("/scan/lines", scan_layout.pack(rows[a:b], stamp), time, number)
-            if truth_rows is not None and truth_layout is not None:
-                self.write("/truth/lines", truth_layout.pack(truth_rows[a:b], stamp), time, number)
+            if truth_part is not None and truth_layout is not None:
+                self.write("/truth/lines", truth_layout.pack(truth_part[a:b], stamp), time, number)
         self._stripes += len(first)
         self.time_ns = max(self.time_ns, times[-1])
 
@@ -276,11 +283,12 @@ class RecordingWriter:
                 for number, origin in self._origins.items():
                     extras["stripe_origin"][number] = origin
             if self._exact_times:
-                extras["time_ns"] = np.concatenate(self._times)
+                times = np.concatenate(self._times)
+                extras["time_step_ns"] = np.diff(times, prepend=np.int64(0))  # near constant
             if extras:
                 self.attach("scan.npz", "application/zip", archives.pack(extras))
             if self._truth:
-                truth, points = _joined(self._truth), np.concatenate(self._points)
+                truth, points = joined(self._truth), np.concatenate(self._points)
                 content = archives.pack_truth(truth, points)
                 self.attach("ground_truth.npz", "application/zip", content)
             self._writer.finish()
@@ -316,33 +324,18 @@ class RecordingWriter:
             "time": "nominal" if scans.time_ns is None else "recorded",
         }
 
-    def _scan_rows(
-        self, scans: Scans, points: np.ndarray, normals: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows of /scan/lines, and the positions [mm] that a reader will see."""
+    def _position_type(self, points: np.ndarray) -> str:
+        """Return the type of x, y, z, which the first piece decides.
+
+        Raises:
+            DataError: Single precision was decided, and does not do for these points.
+        """
         if self._precise is None:
             self._precise = needs_double(points)
         elif not self._precise and needs_double(points):
             what = "positions so large need double precision from the first stripe on"
             raise DataError(what, path=self.path, hint="open the writer with precise=True")
-        position = "<f8" if self._precise else "<f4"
-        fields = [("x", position), ("y", position), ("z", position)]
-        if normals is not None:
-            fields += _NORMAL
-        if scans.column is not None:
-            fields.append(("column", "<u4"))
-        if scans.view is not None:
-            fields.append(("view", "<u2"))
-        rows = np.empty(len(points), np.dtype(fields + _RGBA))
-        put_columns(rows, "xyz", points / METRE)
-        if normals is not None:
-            put_columns(rows, ("normal_x", "normal_y", "normal_z"), normals)
-        for name in ("column", "view"):
-            if name in (rows.dtype.names or ()):
-                rows[name] = getattr(scans, name)
-        put_colors(rows, np.array(SCAN_COLOR, np.uint8))
-        stored = np.stack([rows[name].astype(np.float64) for name in "xyz"], axis=1) * METRE
-        return rows, stored
+        return "<f8" if self._precise else "<f4"
 
     def _stripe_times(self, scans: Scans, bounds: np.ndarray) -> list[int]:
         """Return the time of every message, and note whether stripes have inner times."""
@@ -375,78 +368,3 @@ class RecordingWriter:
             self.register("/tf", messages.FrameTransforms, {"units": "m"})
             message = messages.transform_message(entries, self.start_ns + time)
             self.write("/tf", message.SerializeToString(), time, number)
-
-
-def needs_double(points: np.ndarray) -> bool:
-    """Say whether single-precision metres would move a point [mm] by more than 1 um."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        rounded = (points / METRE).astype(np.float32).astype(np.float64) * METRE
-        finite = np.isfinite(points)
-        return bool(np.any(np.abs(rounded - points)[finite] > RESOLUTION_MM))
-
-
-def put_columns(rows: np.ndarray, names: str | tuple[str, ...], values: np.ndarray) -> None:
-    """Copy the columns of an (N, k) array into k fields of structured rows."""
-    with np.errstate(over="ignore"):
-        for i, name in enumerate(names):
-            rows[name] = values[:, i]
-
-
-def put_colors(rows: np.ndarray, rgba: np.ndarray) -> None:
-    """Copy RGBA u8, shape (N, 4) or (4,), into the colour fields of structured rows."""
-    for i, (name, _) in enumerate(_RGBA):
-        rows[name] = rgba[..., i]
-
-
-def _in_world(scans: Scans) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return points and normals in the world frame."""
-    points, normals = scans.points, scans.normals
-    if scans.frame == "world":
-        return points, normals
-    assert scans.T_world_view is not None  # `Scans` in the view frame have poses
-    view = np.zeros(len(points), np.int32) if scans.view is None else scans.view
-    points = points.copy()
-    normals = None if normals is None else normals.copy()
-    for k in np.unique(view).tolist():
-        mine = view == k
-        points[mine] = moved(scans.T_world_view[k], points[mine])
-        if normals is not None:
-            normals[mine] = normals[mine] @ scans.T_world_view[k][:3, :3].T
-    return points, normals
-
-
-def _truth_rows(truth: Truth, scan_rows: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the rows of /truth/lines: measured positions, ids, true normals, error, colours."""
-    assert scan_rows.dtype.fields is not None
-    fields = [(name, scan_rows.dtype.fields[name][0].str) for name in "xyz"] + [("patch", "<i4")]
-    if truth.surface is not None:
-        fields.append(("surface_id", "<i4"))
-    if truth.normal is not None:
-        fields += _NORMAL
-    if truth.position is not None and truth.normal is not None:
-        fields.append(("error_100nm", "<i2"))
-    rows = np.empty(len(points), np.dtype(fields + _RGBA))
-    for name in "xyz":
-        rows[name] = scan_rows[name]
-    rows["patch"] = truth.patch
-    if truth.surface is not None:
-        rows["surface_id"] = truth.surface
-    if truth.normal is not None:
-        put_columns(rows, ("normal_x", "normal_y", "normal_z"), truth.normal)
-    if truth.position is not None and truth.normal is not None:
-        error = np.einsum("ij,ij->i", points - truth.position, truth.normal) / ERROR_STEP_MM
-        rows["error_100nm"] = np.clip(np.rint(np.nan_to_num(error)), -32767, 32767)
-    put_colors(rows, colors(truth.patch))
-    return rows
-
-
-def _joined(pieces: list[Truth]) -> Truth:
-    """Return the truth of all pieces, one after the other."""
-    if len(pieces) == 1:
-        return pieces[0]
-    fields: dict[str, Any] = {}
-    for name in ("patch", "surface", "kind", "position", "normal", "edge_distance", "edge_class"):
-        values = [getattr(piece, name) for piece in pieces]
-        if all(value is not None for value in values):
-            fields[name] = np.concatenate(values)
-    return Truth(info=pieces[0].info, **fields)

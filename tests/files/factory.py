@@ -26,7 +26,9 @@ def make(
     for v in range(views):
         for s in range(stripes):
             y = np.linspace(0.0, 60.0, width) + rng.uniform(-0.05, 0.05, width)
-            parts.append((np.full(width, v), np.full(width, v * stripes + s), np.arange(width), x[s], y))
+            parts.append(
+                (np.full(width, v), np.full(width, v * stripes + s), np.arange(width), x[s], y)
+            )
     view = np.concatenate([p[0] for p in parts]).astype(np.int32)
     stripe = np.concatenate([p[1] for p in parts]).astype(np.int32)
     column = np.concatenate([p[2] for p in parts]).astype(np.int32)
