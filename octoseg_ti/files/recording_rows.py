@@ -107,7 +107,7 @@ def truth_rows(truth: Truth, scan: np.ndarray, points: np.ndarray) -> np.ndarray
     Args:
         truth: The truth.
         scan: The rows of /scan/lines, shape (N,).
-        points: Measured positions [mm], world frame, shape (N, 3).
+        points: Measured positions as the rows hold them [mm], world frame, shape (N, 3).
     """
     assert scan.dtype.fields is not None
     layout = _truth_dtype(truth, scan.dtype.fields["x"][0].str)

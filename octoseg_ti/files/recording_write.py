@@ -197,9 +197,10 @@ class RecordingWriter:
         rows = scan_rows(scans, points, normals, truth, self._position_type(points))
         truth_part = None
         if truth is not None:
-            truth_part = truth_rows(truth, rows, points)
+            stored = positions(rows)
+            truth_part = truth_rows(truth, rows, stored)
             self._truth.append(truth)
-            self._points.append(positions(rows))
+            self._points.append(stored)
         if scans.stripe is None:
             bounds = np.append(np.arange(0, len(points), _BLOCK), len(points))
         else:
