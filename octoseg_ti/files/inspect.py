@@ -42,16 +42,14 @@ def describe(path: str | Path) -> dict[str, Any]:
         "bytes": path.stat().st_size,
     }
     if suffix == ".mcap":
-        from octoseg_ti.files.recording_read import collect
+        from octoseg_ti.files.recording_read import RESULT_TOPIC, SCAN_TOPIC, collect
 
         contents = collect(path, None)
         facts |= _recording_facts(contents)
         has_result = "result.npz" in contents.attachments
-        clouds = [topic["topic"] for topic in facts["topics"] if topic["schema"] == _CLOUD]
-        if has_result and "/scan/lines" not in clouds:
-            return facts | _result_facts(path)
-        if "/scan/lines" not in clouds and len(clouds) != 1:
-            return facts
+        clouds = {topic["topic"] for topic in facts["topics"] if topic["schema"] == _CLOUD}
+        if not clouds & {SCAN_TOPIC, RESULT_TOPIC} and len(clouds) != 1:
+            return facts  # nothing, or too much, to read as scans
     elif suffix == ".npz":
         from octoseg_ti.files.npz import load
 

@@ -21,6 +21,8 @@ def decompress(data: bytes, size: int) -> bytes:
             control = data[at]
             at += 1
             if control < 32:
+                if at + control + 1 > end:
+                    raise ValueError("the data end in the middle of a copy")
                 out += data[at : at + control + 1]
                 at += control + 1
                 continue

@@ -20,6 +20,7 @@ from octoseg_ti.files.validation import make_scans, make_truth, parsing
 from octoseg_ti.types import Scans, Segmentation, Truth
 
 SCAN_TOPIC = "/scan/lines"
+RESULT_TOPIC = "/segments/points"
 CLOUD_SCHEMA = "foxglove.PointCloud"
 _MAX_HOPS = 64  # links of a transform chain; more means a loop
 
@@ -87,12 +88,12 @@ def read_scans(path: str | Path, *, topic: str | None = None) -> Scans:
     """Read the scan lines of a recording.
 
     A recording of ours comes back as it was: float32 metres as written, times, columns, views,
-    poses. In a foreign one every message of the topic is a stripe (one message alone is an
+    poses; one that holds a result only gives the points, stripes and views of the result. In a foreign one every message of the topic is a stripe (one message alone is an
     unorganised cloud); messages in a frame with a known transform are moved to its root frame.
 
     Args:
         path: The recording.
-        topic: A foxglove.PointCloud topic; default: ``/scan/lines``, else the only one.
+        topic: A foxglove.PointCloud topic; default: ours, else the only one.
 
     Returns:
         The scans, world frame, mm.
@@ -103,11 +104,13 @@ def read_scans(path: str | Path, *, topic: str | None = None) -> Scans:
     wanted = {topic or SCAN_TOPIC, "/tf"}
     contents = collect(path, None if topic is None else wanted)
     channel = _cloud_channel(contents, topic)
-    ours = channel.topic == SCAN_TOPIC and "octoseg.run" in contents.metadata
+    ours = "octoseg.run" in contents.metadata
     mine = [m for m in contents.messages if m.channel_id == channel.id]
     with parsing(path, "MCAP", BROKEN):
-        if ours:
+        if ours and channel.topic == SCAN_TOPIC:
             values = _own_scans(contents, channel, mine)
+        elif ours and channel.topic == RESULT_TOPIC:
+            values = _result_scans(contents, mine)
         else:
             values = _foreign_scans(contents, channel)
     return make_scans(path, values)
@@ -136,7 +139,7 @@ def read_segmentation(path: str | Path) -> Segmentation:
     Raises:
         DataError: Damaged, or there is no result in it.
     """
-    contents = collect(path, {"/segments/points"})
+    contents = collect(path, {RESULT_TOPIC})
     attachment = contents.attachments.get("result.npz")
     if attachment is None or not contents.messages:
         what = "this recording holds no result"
@@ -160,7 +163,8 @@ def _cloud_channel(contents: Contents, topic: str | None) -> Channel:
     clouds = sorted(name for name, c in topics.items() if contents.schema_of(c) == CLOUD_SCHEMA)
     name = topic
     if name is None:
-        name = SCAN_TOPIC if SCAN_TOPIC in topics else clouds[0] if len(clouds) == 1 else None
+        ours = [own for own in (SCAN_TOPIC, RESULT_TOPIC) if own in topics]
+        name = ours[0] if ours else clouds[0] if len(clouds) == 1 else None
     if name is None and clouds:
         what = f"several point cloud topics: {', '.join(clouds)}"
         raise DataError(what, path=path, hint="choose one with topic=")
@@ -220,6 +224,17 @@ def _own_scans(contents: Contents, channel: Channel, mine: list[Message]) -> dic
         if "time_step_ns" in exact:
             values["time_ns"] = np.cumsum(exact.pop("time_step_ns"))
         values |= exact
+    return values
+
+
+def _result_scans(contents: Contents, mine: list[Message]) -> dict[str, Any]:
+    """Return the fields of `Scans` that a result of ours keeps; normals are estimated anew."""
+    rows, _ = _rows(mine)
+    values: dict[str, Any] = {"points": positions(rows)}
+    values["name"] = contents.metadata["octoseg.run"].get("name", "")
+    for name, column in (("stripe", "line"), ("column", "column"), ("view", "view")):
+        if column in (rows.dtype.names or ()):
+            values[name] = rows[column]
     return values
 
 

@@ -83,8 +83,12 @@ def test_junk_is_refused(whole, junk, end):
     assert_refused(path)
 
 
-@pytest.mark.parametrize("suffix", [".mcap", ".npz", ".ply", ".ply.gz", ".pcd", ".xyz", ".las", ".e57"])
-@pytest.mark.parametrize("content", [b"", b"hello", b"\x00" * 200, b"ply\n", b"\x1f\x8b\x08", b"LASF"])
+@pytest.mark.parametrize(
+    "suffix", [".mcap", ".npz", ".ply", ".ply.gz", ".pcd", ".xyz", ".las", ".e57"]
+)
+@pytest.mark.parametrize(
+    "content", [b"", b"hello", b"\x00" * 200, b"ply\n", b"\x1f\x8b\x08", b"LASF"]
+)
 def test_wrong_content_is_refused(tmp_path, suffix, content):
     path = tmp_path / f"wrong{suffix}"
     path.write_bytes(content)

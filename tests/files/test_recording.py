@@ -112,6 +112,11 @@ def test_result_without_scans_is_a_recording_of_its_own(everything, tmp_path):
     write(tmp_path / "r.mcap", result)
     assert_equal(read_segmentation(tmp_path / "r.mcap"), result, but=("points",))
     assert read_truth(tmp_path / "r.mcap") is None
+    back = read(tmp_path / "r.mcap")
+    np.testing.assert_array_equal(back.points, as_stored(result.points))
+    np.testing.assert_array_equal(back.stripe, result.stripe)
+    np.testing.assert_array_equal(back.view, result.view)
+    assert back.normals is None
     write(tmp_path / "rt.mcap", result, truth=truth)
     assert_equal(read_truth(tmp_path / "rt.mcap"), truth)
 
@@ -174,9 +179,7 @@ def test_initial_cells_hold_every_leaf(everything):
     corner, guessed = initial_cells(cells)
     assert guessed == 0
     low, high = corner[:, None], corner[:, None] + cells.initial_size
-    inside = (low <= cells.corner + 1e-9) & (
-        cells.corner + cells.size[:, None] <= high + 1e-9
-    )
+    inside = (low <= cells.corner + 1e-9) & (cells.corner + cells.size[:, None] <= high + 1e-9)
     assert inside.all(axis=2).any(axis=0).all()
     assert inside.all(axis=2).any(axis=1).all()
 

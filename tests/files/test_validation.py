@@ -86,13 +86,13 @@ def test_accepted_stripes_are_unique_and_whole(pairs):
     view = np.array([p[0] for p in pairs])
     stripe = np.array([p[1] for p in pairs])
     try:
-        scans = make_scans(None, {"points": np.zeros((len(pairs), 3)), "stripe": stripe, "view": view})
+        scans = make_scans(
+            None, {"points": np.zeros((len(pairs), 3)), "stripe": stripe, "view": view}
+        )
     except DataError:
         first = runs(stripe, view)[:-1]
         met = [(view[k], stripe[k]) for k in first]
-        falls = any(
-            a[0] == b[0] and b[1] < a[1] for i, a in enumerate(met) for b in met[i + 1 :]
-        )
+        falls = any(a[0] == b[0] and b[1] < a[1] for i, a in enumerate(met) for b in met[i + 1 :])
         assert len(set(met)) < len(met) or falls
         return
     first = runs(scans.stripe, scans.view)[:-1]
