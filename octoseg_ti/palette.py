@@ -17,7 +17,7 @@ def _table() -> np.ndarray:
     for k in range(_PERIOD):
         hue = (0.58 + k * _GOLDEN) % 1.0
         # Lightness and saturation alternate, so that hues that come round again still differ.
-        red, green, blue = colorsys.hls_to_rgb(hue, (0.50, 0.62, 0.40)[k % 3], (0.65, 0.55)[k % 2])
+        red, green, blue = colorsys.hls_to_rgb(hue, (0.52, 0.68, 0.38)[k % 3], (0.75, 0.5)[k % 2])
         rows.append((round(255 * red), round(255 * green), round(255 * blue), 255))
     return np.array([*rows, _UNLABELLED], np.uint8)
 
