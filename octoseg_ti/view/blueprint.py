@@ -38,7 +38,7 @@ def blueprint(
         view: Where to look from.
         truth: With the tabs of the truth.
         result: With the tabs of a segmentation, and its report beside them.
-        playing: Follow the data as they arrive, instead of waiting at the last stripe.
+        playing: Open at the scan, where the stripes arrive, instead of at the result.
     """
     import rerun.blueprint as rrb
 
@@ -58,11 +58,8 @@ def blueprint(
             row_shares=[2, 1, 1],
         )
         layout = rrb.Horizontal(tabs, side, column_shares=[3, 1])
-    time = rrb.TimePanel(
-        state="collapsed",
-        timeline="scan_line",
-        play_state="following" if playing else "paused",
-    )
+    # Paused, the viewer would open at the first stripe and show nothing but that.
+    time = rrb.TimePanel(state="collapsed", timeline="scan_line", play_state="following")
     return rrb.Blueprint(layout, time, collapse_panels=True)
 
 
@@ -73,7 +70,7 @@ def _view(rrb: Any, view: Viewpoint, name: str, contents: tuple[str, ...]) -> An
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
     # Everything in the bounding sphere is in sight of the viewer's eye at this distance.
-    eye = view.center - 2.3 * view.radius * np.asarray(view.direction)
+    eye = view.center - 1.8 * view.radius * np.asarray(view.direction)
     return rrb.Spatial3DView(
         origin="/world",
         contents=list(contents),

@@ -23,6 +23,7 @@ import numpy as np
 from octoseg_ti.errors import DataError
 from octoseg_ti.evaluation import Scores
 from octoseg_ti.types import Segmentation, StopReason, SurfaceKind, Truth
+from octoseg_ti.view.stream import replaced
 
 _PACKAGES = ("taichi", "numpy", "scipy", "rerun-sdk", "mcap", "pillow")
 
@@ -102,6 +103,7 @@ def _parameters(result: Segmentation) -> Section:
     for section, values in result.params.to_dict().items():
         for name, value in values.items():
             text = f"{value:.6g}" if isinstance(value, float) else str(value)
+            text = "-" if value is None else text
             if name == "homogeneity" and value is not None:
                 text += f" rad ({math.degrees(value):.3g} deg)"
             rows.append((f"{section}.{name}", text))
@@ -376,13 +378,11 @@ def write_report(
         stem.with_name(stem.name + ".md"): markdown(result, scores=scores, truth=truth, arch=arch),
     }
     for target, text in texts.items():
-        part = target.with_name(target.name + ".part")
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
-            part.write_text(text, encoding="utf-8")
-            os.replace(part, target)
         except OSError as error:
-            raise DataError(f"cannot be written: {error.strerror or error}", path=target) from error
-        finally:
-            part.unlink(missing_ok=True)
+            what = f"cannot be written: {error.strerror or error}"
+            raise DataError(what, path=target) from error
+        with replaced(target) as part:
+            part.write_text(text, encoding="utf-8")
     return list(texts)

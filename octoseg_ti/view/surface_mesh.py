@@ -47,8 +47,10 @@ def patch_mesh(result: Segmentation, k: int) -> Mesh | None:
     """
     on = (result.labels == k) & np.isfinite(result.points).all(axis=1)
     points, normals = result.points[on], result.normals[on]
+    if len(points) < 3:
+        return None
     chart = _chart(SurfaceKind(int(result.kind[k])), result.parameters[k], points)
-    if chart is None or len(points) < 3:
+    if chart is None:
         return None
     filled, origin, step, wraps = _raster(chart)
     u, v = np.nonzero(filled)
