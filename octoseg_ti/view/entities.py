@@ -8,7 +8,7 @@ import numpy as np
 
 from octoseg_ti import palette
 from octoseg_ti.errors import DataError
-from octoseg_ti.evaluation import wrong_points
+from octoseg_ti.evaluation import evaluate, wrong_points
 from octoseg_ti.types import Scans, Segmentation, SurfaceKind, Truth
 from octoseg_ti.view import scene
 from octoseg_ti.view.report import markdown
@@ -29,7 +29,7 @@ def shift_of(*clouds: np.ndarray) -> np.ndarray:
     Zero for parts near the origin. The entity ``/world`` carries the same shift as its transform,
     so that positions in the viewer stay true.
     """
-    finite = [cloud[np.isfinite(cloud).all(axis=1)] for cloud in clouds]
+    finite = [cloud[scene.finite_rows(cloud)] for cloud in clouds]
     finite = [cloud for cloud in finite if len(cloud)]
     if not finite:
         return np.zeros(3)
@@ -91,7 +91,7 @@ def log_stripes(rec: Any, scans: Scans, *, shift: np.ndarray | None = None) -> N
         return
     index = stripe_index(rr, scans, starts)
     extra = {
-        name: np.asarray(column)
+        name: _one_each(column)
         for name, column in (("column", scans.column), ("view", scans.view))
         if column is not None
     }
@@ -105,6 +105,14 @@ def log_stripes(rec: Any, scans: Scans, *, shift: np.ndarray | None = None) -> N
     if scans.stripe_origin is not None:
         log_scanner_axes(rec)
         log_scanner(rec, scans, starts, shift)
+
+
+def _one_each(values: np.ndarray) -> Any:
+    """Return an Arrow column of one value a row; Rerun would make one of Python lists."""
+    import pyarrow as pa
+
+    flat = pa.array(np.ascontiguousarray(values))
+    return pa.ListArray.from_arrays(pa.array(np.arange(len(flat) + 1, dtype=np.int32)), flat)
 
 
 def stripe_index(rr: Any, scans: Scans, starts: np.ndarray) -> list[Any]:
@@ -133,7 +141,7 @@ def log_scanner(rec: Any, scans: Scans, starts: np.ndarray, shift: np.ndarray) -
     places = np.asarray(scans.stripe_origin, np.float64)
     stripe = np.asarray(scans.stripe)[starts]
     known = stripe < len(places)
-    known[known] = np.isfinite(places[stripe[known]]).all(axis=1)
+    known[known] = scene.finite_rows(places[stripe[known]])
     if not known.any():
         return
     starts, stripe = starts[known], stripe[known]
@@ -199,8 +207,8 @@ def log_segmentation(
         # An earlier answer may have had more patches or levels than this one.
         for entity in ("/world/surfaces", "/world/octree"):
             rec.log(entity, rr.Clear(recursive=True))
-    points = result.points - shift
-    keep = np.isfinite(points).all(axis=1)
+    points = (result.points - shift).astype(np.float32)
+    keep = scene.finite_rows(points)
     has_normal = keep & result.normals.any(axis=1)
     colors = scene.normal_colors(result.normals)
     _cloud(rec, "/world/normals/points", points, colors, on=has_normal, static=static)
@@ -230,7 +238,7 @@ def log_segmentation(
         colors = scene.ERROR_COLORS[wrong]
         _cloud(rec, "/world/errors/points", points, colors, wrong, static=static)
     _log_surfaces(rec, result, shift, static)
-    _log_numbers(rec, result, static)
+    _log_numbers(rec, result, truth, static)
 
 
 def _cloud(
@@ -246,14 +254,14 @@ def _cloud(
     """Log the finite points among ``on``; class 0 = none, else label + 1."""
     import rerun as rr
 
-    keep = np.isfinite(positions).all(axis=1)
+    keep = scene.finite_rows(positions)
     if on is not None:
         keep &= on
     ids = None
     if classes is not None:
         ids = np.clip(classes[keep].astype(np.int64) + 1, 0, 65_535).astype(np.uint16)
     points = rr.Points3D(
-        positions[keep].astype(np.float32),
+        positions[keep].astype(np.float32, copy=False),
         colors=colors[keep],
         class_ids=ids,
         radii=rr.Radius.ui_points(_POINT),
@@ -316,7 +324,7 @@ def _log_surfaces(rec: Any, result: Segmentation, shift: np.ndarray, static: boo
         )
 
 
-def _log_numbers(rec: Any, result: Segmentation, static: bool) -> None:
+def _log_numbers(rec: Any, result: Segmentation, truth: Truth | None, static: bool) -> None:
     import rerun as rr
 
     if result.patch_count:
@@ -327,7 +335,9 @@ def _log_numbers(rec: Any, result: Segmentation, static: bool) -> None:
         rec.log("/metrics/milliseconds", rr.BarChart(list(outer.values())), static=static)
     for name, seconds in result.seconds.items():
         rec.log(f"/metrics/seconds/{name}", rr.Scalars(seconds), static=static)
-    text = rr.TextDocument(markdown(result), media_type=rr.MediaType.MARKDOWN)
+    scores = None if truth is None else evaluate(result, truth)
+    report = markdown(result, scores=scores, truth=truth)
+    text = rr.TextDocument(report, media_type=rr.MediaType.MARKDOWN)
     rec.log("/report", text, static=static)
     lines = [f"- {k}: {v}" for k, v in _flat(result.params.to_dict())]
     text = rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)

@@ -48,6 +48,8 @@ class _Subject:
     result: Segmentation
     truth: Truth | None
     camera: Camera
+    at: np.ndarray
+    """Projected points, shape (N, 3)."""
     size: int
     light: np.ndarray
 
@@ -110,20 +112,19 @@ def _subject(result: Segmentation, truth: Truth | None, width: int, height: int)
     normals = np.nan_to_num(result.normals)
     light = 0.55 + 0.45 * np.abs(normals @ lamp.astype(np.float32))
     light[~normals.any(axis=1)] = 0.8
+    at = camera.project(result.points)
     return _Subject(
         result=result,
         truth=truth,
         camera=camera,
-        size=_point_size(result.points, camera),
+        at=at,
+        size=_point_size(at, camera),
         light=light,
     )
 
 
-def _point_size(points: np.ndarray, camera: Camera) -> int:
-    """Return the side of the squares [pixels] that closes the gaps between the points."""
-    at = camera.project(points[np.isfinite(points).all(axis=1)])
-    if not len(at):
-        return 2
+def _point_size(at: np.ndarray, camera: Camera) -> int:
+    """Return the side of the squares [pixels] that closes the gaps between projected points."""
     # Area of the picture that is covered, seen in coarse tiles; a tile is covered when any point
     # is in it.
     tile = 16
@@ -131,10 +132,10 @@ def _point_size(points: np.ndarray, camera: Camera) -> int:
     inside = (
         (at[:, 0] >= 0) & (at[:, 0] < camera.width) & (at[:, 1] >= 0) & (at[:, 1] < camera.height)
     )
-    tiles = (at[inside] // tile).astype(np.int64)
-    covered = len(np.unique(tiles[:, 1] * columns + tiles[:, 0])) * tile * tile
+    tiles = (at[inside, :2] // tile).astype(np.int64)
+    covered = np.count_nonzero(np.bincount(tiles[:, 1] * columns + tiles[:, 0])) * tile * tile
     gap = np.sqrt(covered / max(int(inside.sum()), 1))
-    return int(np.clip(np.ceil(1.4 * gap), 1, 8))
+    return int(np.clip(np.ceil(1.7 * gap), 1, 8))
 
 
 def _shaded(subject: _Subject, colors: np.ndarray) -> np.ndarray:
@@ -145,7 +146,7 @@ def _points(subject: _Subject, colors: np.ndarray, on: np.ndarray | None = None)
     canvas = Canvas(subject.camera)
     shaded = _shaded(subject, colors)
     on = np.ones(len(shaded), bool) if on is None else on
-    canvas.points(subject.result.points[on], shaded[on], size=subject.size)
+    canvas.projected(subject.at[on], shaded[on], size=subject.size)
     return canvas.image()
 
 
@@ -163,8 +164,8 @@ def _normals(subject: _Subject) -> np.ndarray:
     result = subject.result
     canvas = Canvas(subject.camera)
     colors = scene.normal_colors(result.normals)
-    canvas.points(result.points, _pale(colors), size=subject.size)
-    some = np.flatnonzero(result.normals.any(axis=1) & np.isfinite(result.points).all(axis=1))
+    canvas.projected(subject.at, _pale(colors), size=subject.size)
+    some = np.flatnonzero(result.normals.any(axis=1) & scene.finite_rows(result.points))
     some = some[:: max(1, -(-len(some) // _ARROWS))]
     length = 14 / subject.camera.scale
     ends = result.points[some] + length * result.normals[some]
@@ -190,7 +191,7 @@ def _final_grid(subject: _Subject) -> np.ndarray:
     canvas = Canvas(subject.camera)
     deepest = int(cells.level.max(initial=0))
     shaded = _shaded(subject, scene.level_colors(result.level, deepest))
-    canvas.points(result.points, (0.5 * shaded + 0.5 * 235).astype(np.uint8), size=subject.size)
+    canvas.projected(subject.at, (0.5 * shaded + 0.5 * 235).astype(np.uint8), size=subject.size)
     for level in np.unique(cells.level):
         on = cells.level == level
         size = float(cells.size[on][0])
@@ -207,8 +208,8 @@ def _edge_points(subject: _Subject) -> np.ndarray:
     canvas = Canvas(subject.camera)
     on = result.edge > 0
     rest = _pale(_shaded(subject, scene.edge_colors(result.edge)))
-    canvas.points(result.points[~on], rest[~on], size=subject.size)
-    canvas.points(result.points[on], scene.edge_colors(result.edge[on]), size=subject.size)
+    canvas.projected(subject.at[~on], rest[~on], size=subject.size)
+    canvas.projected(subject.at[on], scene.edge_colors(result.edge[on]), size=subject.size)
     return canvas.image()
 
 

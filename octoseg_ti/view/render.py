@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from octoseg_ti.view.scene import Viewpoint
+from octoseg_ti.view.scene import Viewpoint, finite_rows
 
 _BACKGROUND = (255, 255, 255)
 # Fragments handled at once; bounds the memory of scenes with many boxes.
@@ -69,7 +69,7 @@ class Camera:
         right = _unit(right)
         down = np.cross(direction, right)
         points = np.asarray(points, np.float64).reshape(-1, 3)
-        points = points[np.isfinite(points).all(axis=1)]
+        points = points[finite_rows(points)]
         if not len(points):
             points = np.zeros((1, 3))
         # Around the middle, so that far offsets do not eat digits.
@@ -98,9 +98,13 @@ class Camera:
         return cls.fit(points, direction=view.direction, up=view.up, width=width, height=height)
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Return (x, y, depth) in pixels, shape (N, 3), f32; larger depth = farther away."""
+        """Return (x, y, depth) in pixels, shape (N, 3), f32; larger depth = farther away.
+
+        Points that are not finite are not finite in the picture either, and are never drawn.
+        """
         axes = np.stack([self.right, self.down, self.direction], axis=1) * self.scale
-        out = (np.asarray(points, np.float64) - self.center) @ axes
+        with np.errstate(invalid="ignore"):
+            out = (np.asarray(points, np.float64) - self.center) @ axes
         out[:, 0] += self.width / 2
         out[:, 1] += self.height / 2
         return out.astype(np.float32)
@@ -124,10 +128,12 @@ class Canvas:
             colors: One colour, or one for every point, shape (3 or 4,) or (N, 3 or 4), u8.
             size: Side of the square [pixels].
         """
-        finite = np.isfinite(points).all(axis=1)
-        colors = _per_row(colors, len(points))[finite]
+        self.projected(self.camera.project(points), colors, size=size)
+
+    def projected(self, at: np.ndarray, colors: Any, *, size: int = 2) -> None:
+        """Draw points as `points` does, from what `Camera.project` made of them."""
         layer = Canvas(self.camera)
-        layer._fragments(self.camera.project(points[finite]), colors)
+        layer._fragments(at, _per_row(colors, len(at)))
         # Only the nearest point of a pixel can be the nearest one of its square anywhere, so the
         # squares are grown from pixels, at a cost that does not depend on the number of points.
         height, width = self.depth.shape
@@ -239,10 +245,9 @@ class Canvas:
         flat = self.depth.reshape(-1)
         nearer = depth < flat[place]
         place, depth, rows = place[nearer], depth[nearer], rows[nearer]
-        # Far to near: of several values for one pixel the last assignment stays.
-        order = np.argsort(-depth, kind="stable")
-        flat[place[order]] = depth[order]
-        self.color.reshape(-1)[place[order]] = colors[rows[order]]
+        np.minimum.at(flat, place, depth)
+        nearest = depth == flat[place]
+        self.color.reshape(-1)[place[nearest]] = colors[rows[nearest]]
 
     def image(self, *, eye_dome: float = 1.0, background: Any = _BACKGROUND) -> np.ndarray:
         """Return the picture, shape (height, width, 3), u8.

@@ -23,6 +23,7 @@ import numpy as np
 from octoseg_ti.errors import DataError
 from octoseg_ti.evaluation import Scores
 from octoseg_ti.types import Segmentation, StopReason, SurfaceKind, Truth
+from octoseg_ti.view.scene import finite_rows
 from octoseg_ti.view.stream import replaced
 
 _PACKAGES = ("taichi", "numpy", "scipy", "rerun-sdk", "mcap", "pillow")
@@ -68,7 +69,7 @@ def sections(
 
 
 def _input(result: Segmentation, truth: Truth | None) -> Section:
-    points = result.points[np.isfinite(result.points).all(axis=1)]
+    points = result.points[finite_rows(result.points)]
     rows = [("points", f"{len(result):,}")]
     if len(points) < len(result):
         rows.append(("points that are not finite", f"{len(result) - len(points):,}"))

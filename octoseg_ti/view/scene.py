@@ -44,6 +44,13 @@ class Viewpoint:
     """Half the diagonal of the bounding box [mm]; never 0."""
 
 
+def finite_rows(rows: np.ndarray) -> np.ndarray:
+    """Say of every row of shape (N, 3) whether it is finite, shape (N,), bool."""
+    # Column by column: several times as fast as a reduction over rows of three.
+    x, y, z = np.isfinite(rows).T
+    return x & y & z
+
+
 def world_points(scans: Scans) -> np.ndarray:
     """Return the points in the world frame [mm], shape (N, 3), f64.
 
@@ -72,7 +79,7 @@ def viewpoint(points: np.ndarray, normals: np.ndarray | None = None) -> Viewpoin
         normals: Normals pointing to the probe, shape (N, 3); they tell the scanned side. Without
             them, or when they point all around, z is up.
     """
-    points = points[np.isfinite(points).all(axis=1)]
+    points = points[finite_rows(points)]
     low = points.min(axis=0) if len(points) else np.zeros(3)
     high = points.max(axis=0) if len(points) else np.ones(3)
     up = np.array([0.0, 0.0, 1.0])

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from octoseg_ti.types import Segmentation, SurfaceKind
+from octoseg_ti.view.scene import finite_rows
 
 _TILES = 24
 _MOST_BINS = 40_000
+_MOST_POINTS = 60_000
 
 Evaluate = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -45,7 +47,9 @@ def patch_mesh(result: Segmentation, k: int) -> Mesh | None:
     The surface is unrolled and divided into squares about as wide as two points are apart; the
     squares that hold points, and single holes among them, become triangles.
     """
-    on = (result.labels == k) & np.isfinite(result.points).all(axis=1)
+    on = np.flatnonzero(result.labels == k)
+    on = on[finite_rows(result.points[on])]
+    on = on[:: max(1, -(-len(on) // _MOST_POINTS))]
     points, normals = result.points[on], result.normals[on]
     if len(points) < 3:
         return None

@@ -114,6 +114,11 @@ def test_results_are_static_and_whole(saved, made):
     assert len(boxes) == np.sum(result.cells.level == 0)
 
 
+def test_the_report_is_inside_with_the_scores(saved):
+    (text,) = saved.column("/report", "TextDocument:text", static=True)
+    assert "Measured on the data" in text[0] and "adjusted Rand index" in text[0]
+
+
 def test_the_unit_is_written_down(saved):
     (unit,) = saved.column("/__properties/octoseg", "length_unit", static=True)
     assert unit == ["mm"]
