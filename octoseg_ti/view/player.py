@@ -170,7 +170,7 @@ class _Player:
             starts = self.bounds[:-1]
             if self.scans.stripe_origin is not None:
                 log_scanner_axes(rec)
-            due = _due(self.scans.time_ns, starts, rate)
+            due = _due(self.scans.time_ns, starts, rate).tolist()
             colors = stripe_colors(self.scans, starts)
             start = self.clock()
             for k in range(len(starts)):
