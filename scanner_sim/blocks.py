@@ -58,7 +58,9 @@ def test_block() -> Part:
         half_space((17.0, 0.0, 22.0), (math.sin(fall), 0.0, math.cos(fall))),
     )
     boss = rod((-30.0, 12.0, 10.0), (-30.0, 12.0, 33.0), 12.0)
-    dome = intersection(sphere((0.0, 14.0, 19.0), 11.0), box((-12.0, 2.0, 10.0), (12.0, 26.0, 31.0)))
+    dome = intersection(
+        sphere((0.0, 14.0, 19.0), 11.0), box((-12.0, 2.0, 10.0), (12.0, 26.0, 31.0))
+    )
     hole = rod((-14.0, -15.0, 16.0), (-14.0, -15.0, 24.0), 10.0)
     return _named(union(difference(body, hole), boss, dome), "test-block", 92_000, _SIDES)
 
@@ -88,7 +90,9 @@ def phone() -> Part:
 def _casing() -> Part:
     """Return the body: 110 mm of the length, top at 14 mm, long rims and corners rounded."""
     low, high, half, top, rim, corner = -60.0, 50.0, 21.75, 14.0, 2.0, 3.0
-    chin = half_space((-51.0, 0.0, top), (-math.sin(math.radians(30)), 0, math.cos(math.radians(30))))
+    chin = half_space(
+        (-51.0, 0.0, top), (-math.sin(math.radians(30)), 0, math.cos(math.radians(30)))
+    )
     cuts = []
     for sign in (-1.0, 1.0):
         y, z = sign * (half - rim), top - rim

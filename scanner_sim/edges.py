@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from octoseg_ti.types import EdgeClass, SurfaceKind
-from scanner_sim.quadric import Surfaces, distance, frames, gradient
+from scanner_sim.quadric import distance, frames, gradient
 from scanner_sim.raycast import classify
 
 if TYPE_CHECKING:
@@ -24,10 +24,14 @@ _CELL = 0.5  # cells of the parameter grid [mm]; smaller for small radii
 _CELLS_PER_RADIUS = 4.0
 _MARGIN = 0.05  # the grid reaches this far beyond the faces [mm], so that every face ends on it
 _DEVIATION = 0.002  # chords are split until they follow the edge this closely [mm]
-_SPLITS = 6
-_HALVINGS = 40
+_SPLITS = 9
+_ASIDE = (0.6, 1.2)
+"""How far beside a chord its edge is looked for, in lengths of the chord: a corner of 53 degrees is as
+far away as the chord is long."""
+_HALVINGS = 34
 _PROBE = 0.02  # the neighbour of a face is looked for this far from the edge [mm]
 _TOUCH = 1e-6  # a surface this close to a point of an edge passes through it [mm]
+_SAMPLE = 0.04  # spacing of the places by which the nearest edge is looked up [mm]
 _SMOOTH = math.radians(5.0)  # faces that meet at a smaller angle meet smoothly
 
 
@@ -43,6 +47,18 @@ class Edges(NamedTuple):
     without an angle, shape (E,), u8."""
 
 
+class _Chart(NamedTuple):
+    """Parameters (u, v) of all surfaces, scaled so that a unit is about a millimetre."""
+
+    part: FlatPart
+    first: np.ndarray
+    """Direction from which angles count, or of u, shape (S, 3)."""
+    second: np.ndarray
+    """Direction of a quarter turn, or of v, shape (S, 3)."""
+    scale: np.ndarray
+    """Millimetres per unit of u and v, at the widest place, shape (S, 2)."""
+
+
 class _Chords(NamedTuple):
     """Pieces of the border of faces, in scaled parameters (mm)."""
 
@@ -53,17 +69,15 @@ class _Chords(NamedTuple):
 
 def trace_edges(part: FlatPart) -> Edges:
     """Return all edges of a solid, hidden ones too, to about 0.002 mm."""
-    surface, inner, outer, first, second = _border(part)
-    place = _halve(part, surface, inner, outer)
-    chords = _Chords(surface[first], place[first], place[second])
-    chords = _follow(part, chords)
-    kind = _kinds(part, chords)
+    chart = _chart(part)
+    surface, inner, outer, first, second = _border(chart)
+    place = _halve(chart, surface, inner, outer)
+    chords = _follow(chart, _Chords(surface[first], place[first], place[second]))
+    start = _points(chart, chords.surface, chords.first)
+    end = _points(chart, chords.surface, chords.second)
+    kind = _kinds(part, chords.surface, start, end)
     kept = kind != EdgeClass.NONE
-    return Edges(
-        start=_points(part.surfaces, chords.surface[kept], chords.first[kept]),
-        end=_points(part.surfaces, chords.surface[kept], chords.second[kept]),
-        kind=kind[kept],
-    )
+    return Edges(start[kept], end[kept], kind[kept])
 
 
 def nearest_edge(edges: Edges, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -81,10 +95,15 @@ def nearest_edge(edges: Edges, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
     if len(edges.kind) == 0:
         return np.full(len(points), math.inf), np.full(len(points), EdgeClass.NONE, np.uint8)
     span = edges.end - edges.start
-    tree = cKDTree(0.5 * (edges.start + edges.end))
-    # Pieces are shorter than a cell, so the nearest one has one of the nearest middles.
-    count = min(6, len(edges.kind))
-    candidates = tree.query(points, k=count, workers=-1)[1].reshape(len(points), count)
+    # The nearest of dense samples names the piece to measure to; two of them, because around a corner
+    # the nearest sample may lie on the wrong side.
+    counts = np.ceil(np.linalg.norm(span, axis=1) / _SAMPLE).astype(np.int64).clip(1)
+    owner = np.repeat(np.arange(len(span)), counts)
+    place = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    share = (place + 0.5) / counts[owner]
+    tree = cKDTree(edges.start[owner] + share[:, None] * span[owner])
+    count = min(2, len(owner))
+    candidates = owner[tree.query(points, k=count, workers=-1)[1].reshape(len(points), count)]
     best = np.full(len(points), math.inf)
     kind = np.zeros(len(points), np.uint8)
     squared = np.maximum(np.einsum("ij,ij->i", span, span), 1e-30)
@@ -99,28 +118,37 @@ def nearest_edge(edges: Edges, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return best, kind
 
 
-def _scales(surfaces: Surfaces) -> np.ndarray:
-    """Return millimetres per unit of u and of v, shape (S, 2); 1 where the unit is a millimetre."""
-    kind, a, b = surfaces.kind, surfaces.data[:, 6], surfaces.data[:, 7]
+def _chart(part: FlatPart) -> _Chart:
+    """Return the parameters of all surfaces of a part."""
+    kind, a, b = part.surfaces.kind, part.surfaces.data[:, 6], part.surfaces.data[:, 7]
+    first, second = frames(part.surfaces)
     scale = np.ones((len(kind), 2))
     scale[kind == SurfaceKind.CYLINDER, 0] = a[kind == SurfaceKind.CYLINDER]
     ball = kind == SurfaceKind.SPHERE
     scale[ball] = a[ball, None]
     ring = kind == SurfaceKind.TORUS
     scale[ring, 0], scale[ring, 1] = (a + b)[ring], b[ring]
-    return scale
+    for s in np.flatnonzero(kind == SurfaceKind.CONE):
+        apex, axis = part.surfaces.data[s, :3], part.surfaces.data[s, 3:6]
+        highest = ((_corners(part.surface_boxes[s]) - apex) @ axis).max()
+        scale[s, 0] = max(highest, _MARGIN) * math.tan(a[s])
+    return _Chart(part, first, second, scale)
 
 
-def _points(surfaces: Surfaces, index: np.ndarray, place: np.ndarray) -> np.ndarray:
+def _corners(limits: np.ndarray) -> np.ndarray:
+    """Return the corners of a box, shape (8, 3)."""
+    return np.array([[limits[i, 0], limits[j, 1], limits[k, 2]]
+                     for i in (0, 1) for j in (0, 1) for k in (0, 1)])  # fmt: skip
+
+
+def _points(chart: _Chart, index: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Return positions [mm], shape (N, 3), from scaled parameters, shape (N, 2).
 
     u is a coordinate of a plane, else the angle about the axis; v is the other coordinate, the height
-    (cylinder, cone), the latitude (sphere), or the angle about the tube (torus). The angle of a
-    cone keeps its unit, radians.
+    (cylinder, cone), the latitude (sphere), or the angle about the tube (torus).
     """
-    kind, data = surfaces.kind[index], surfaces.data[index]
-    e1, e2 = (f[index] for f in frames(surfaces))
-    u, v = (place / _scales(surfaces)[index]).T
+    kind, data = chart.part.surfaces.kind[index], chart.part.surfaces.data[index]
+    u, v = (place / chart.scale[index]).T
     a, b = data[:, 6], data[:, 7]
     kinds = [kind == SurfaceKind.CYLINDER, kind == SurfaceKind.CONE, kind == SurfaceKind.SPHERE]
     radius = np.select(kinds, [a, v * np.tan(a), a * np.cos(v)], a + b * np.cos(v))
@@ -129,48 +157,51 @@ def _points(surfaces: Surfaces, index: np.ndarray, place: np.ndarray) -> np.ndar
     x = np.where(flat, u, radius * np.cos(u))
     y = np.where(flat, v, radius * np.sin(u))
     z = np.where(flat, 0.0, height)
-    return data[:, :3] + x[:, None] * e1 + y[:, None] * e2 + z[:, None] * data[:, 3:6]
+    return (
+        data[:, :3] + x[:, None] * chart.first[index] + y[:, None] * chart.second[index]
+        + z[:, None] * data[:, 3:6]
+    )  # fmt: skip
 
 
-def _grid(surfaces: Surfaces, s: int, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _side(chart: _Chart, index: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Return on which side of its surface the part lies at every place; 0 = on none or on both."""
+    return classify(chart.part, _points(chart, index, place), index)
+
+
+def _grid(chart: _Chart, s: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes in u and in v of the grid on one surface, in scaled parameters.
 
     A full turn ends with the node where it began, so that the last cell closes it.
     """
+    surfaces = chart.part.surfaces
     kind = surfaces.kind[s]
     a, b = surfaces.data[s, 6:8]
-    scale = _scales(surfaces)[s]
-    e1, e2 = (f[s] for f in frames(surfaces))
-    corners = np.array([[limits[i, 0], limits[j, 1], limits[k, 2]]
-                        for i in (0, 1) for j in (0, 1) for k in (0, 1)])  # fmt: skip
-    local = (corners - surfaces.data[s, :3]) @ np.stack([e1, e2, surfaces.data[s, 3:6]], axis=1)
+    axes = np.stack([chart.first[s], chart.second[s], surfaces.data[s, 3:6]], axis=1)
+    local = (_corners(chart.part.surface_boxes[s]) - surfaces.data[s, :3]) @ axes
     low, high = local.min(axis=0) - _MARGIN, local.max(axis=0) + _MARGIN
-    turn = np.array([0.0, 2.0 * math.pi])
-    cell = _CELL
+    turn = 2.0 * math.pi * chart.scale[s]
     if kind == SurfaceKind.PLANE:
-        ranges, steps = ((low[0], high[0]), (low[1], high[1])), (cell, cell)
+        ranges, radii = ((low[0], high[0]), (low[1], high[1])), (math.inf, math.inf)
     elif kind == SurfaceKind.CYLINDER:
-        ranges, steps = (turn * scale[0], (low[2], high[2])), (min(cell, a / _CELLS_PER_RADIUS), cell)
+        ranges, radii = ((0.0, turn[0]), (low[2], high[2])), (a, math.inf)
     elif kind == SurfaceKind.CONE:
-        top = max(high[2], _MARGIN)
-        widest = top * math.tan(a)
-        ranges = (turn, (max(low[2], 0.0), top))
-        steps = (min(cell / widest, 1.0 / _CELLS_PER_RADIUS), cell)
+        ranges = ((0.0, turn[0]), (max(low[2], 0.0), max(high[2], _MARGIN)))
+        radii = (float(chart.scale[s, 0]), math.inf)
     elif kind == SurfaceKind.SPHERE:
-        step = min(cell, a / _CELLS_PER_RADIUS)
-        ranges, steps = (turn * a, (-math.pi / 2 * a, math.pi / 2 * a)), (step, step)
+        ranges, radii = ((0.0, turn[0]), (-turn[1] / 4, turn[1] / 4)), (a, a)
     else:
-        step = min(cell, b / _CELLS_PER_RADIUS)
-        ranges, steps = (turn * scale[0], turn * b), (min(cell, a / _CELLS_PER_RADIUS), step)
+        ranges, radii = ((0.0, turn[0]), (0.0, turn[1])), (a, b)
     u, v = (
-        np.linspace(r[0], r[1], max(int(math.ceil((r[1] - r[0]) / step)), 4) + 1)
-        for r, step in zip(ranges, steps, strict=True)
+        np.linspace(
+            low, high, max(math.ceil((high - low) / min(_CELL, r / _CELLS_PER_RADIUS)), 4) + 1
+        )
+        for (low, high), r in zip(ranges, radii, strict=True)
     )
     return u, v
 
 
 def _border(
-    part: FlatPart,
+    chart: _Chart,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the crossings of all grid lines with borders of faces, and the chords between them.
 
@@ -178,19 +209,19 @@ def _border(
         surface, shape (X,); the two nodes around every crossing, shapes (X, 2); the numbers of the two
         crossings of every chord, shapes (D,).
     """
-    count = len(part.surfaces.kind)
-    grids = [_grid(part.surfaces, s, part.surface_boxes[s]) for s in range(count)]
+    kinds = chart.part.surfaces.kind
+    grids = [_grid(chart, s) for s in range(len(kinds))]
     places = [np.stack(np.meshgrid(u, v, indexing="ij"), axis=2) for u, v in grids]
-    index = np.repeat(np.arange(count, dtype=np.int32), [p.size // 2 for p in places])
+    index = np.repeat(np.arange(len(kinds), dtype=np.int32), [p.size // 2 for p in places])
     flat = np.concatenate([p.reshape(-1, 2) for p in places])
-    status = classify(part, _points(part.surfaces, index, flat), index)
+    status = _side(chart, index, flat)
     surface, inner, outer, first, second = [], [], [], [], []
     start = crossings = 0
     for s, place in enumerate(places):
         shape = place.shape[:2]
         sides = status[start : start + shape[0] * shape[1]].reshape(shape)
         start += sides.size
-        _close(part.surfaces.kind[s], sides)
+        _close(kinds[s], sides)
         a, b, one, two = _march(place, sides)
         surface.append(np.full(len(a), s, np.int32))
         inner.append(a)
@@ -235,84 +266,99 @@ def _march(
     return a, b, chords[:, 0], chords[:, 1]
 
 
-def _halve(
-    part: FlatPart, surface: np.ndarray, inner: np.ndarray, outer: np.ndarray
-) -> np.ndarray:
+def _halve(chart: _Chart, surface: np.ndarray, inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
     """Return where between two places the face ends, shape (X, 2)."""
     low, high = inner.copy(), outer.copy()
-    side = classify(part, _points(part.surfaces, surface, low), surface)
+    side = _side(chart, surface, low)
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        same = classify(part, _points(part.surfaces, surface, middle), surface) == side
+        same = _side(chart, surface, middle) == side
         low[same], high[~same] = middle[same], middle[~same]
     return 0.5 * (low + high)
 
 
-def _follow(part: FlatPart, chords: _Chords) -> _Chords:
+def _follow(chart: _Chart, chords: _Chords) -> _Chords:
     """Split chords where the edge leaves them, until none is further off than the limit."""
     done: list[_Chords] = []
     for _ in range(_SPLITS):
-        middle = 0.5 * (chords.first + chords.second)
         run = chords.second - chords.first
-        # The edge lies within half a chord beside the middle, if it does not turn back.
-        aside = 0.5 * np.stack([-run[:, 1], run[:, 0]], axis=1)
-        left, right = middle + aside, middle - aside
-        across = [classify(part, _points(part.surfaces, chords.surface, p), chords.surface)
-                  for p in (left, right)]  # fmt: skip
-        open_ = across[0] != across[1]
-        found = middle.copy()
-        found[open_] = _halve(part, chords.surface[open_], left[open_], right[open_])
-        off = np.linalg.norm(
-            _points(part.surfaces, chords.surface, found)
-            - 0.5 * (_points(part.surfaces, chords.surface, chords.first)
-                     + _points(part.surfaces, chords.surface, chords.second)),
-            axis=1,
-        )  # fmt: skip
-        split = open_ & (off > _DEVIATION)
-        done.append(_Chords(*(values[~split] for values in chords)))
-        kept = _Chords(*(values[split] for values in chords))
-        chords = _Chords(
-            np.concatenate([kept.surface, kept.surface]),
-            np.concatenate([kept.first, found[split]]),
-            np.concatenate([found[split], kept.second]),
+        middle = 0.5 * (chords.first + chords.second)
+        aside = np.stack([-run[:, 1], run[:, 0]], axis=1)
+        length = np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-30)
+        near = aside * (_DEVIATION / length)
+        bent = _side(chart, chords.surface, middle + near) == _side(
+            chart, chords.surface, middle - near
         )
-        if len(chords.surface) == 0:
+        moved = np.zeros(len(bent), bool)
+        place = middle.copy()
+        for share in _ASIDE:
+            left = np.flatnonzero(bent)
+            low, high = middle[left] + share * aside[left], middle[left] - share * aside[left]
+            left_surface = chords.surface[left]
+            open_ = _side(chart, left_surface, low) != _side(chart, left_surface, high)
+            place[left[open_]] = _halve(chart, left_surface[open_], low[open_], high[open_])
+            moved[left[open_]] = True
+            bent[left[open_]] = False
+        # Straight in the parameters may still be an arc in space.
+        ends = [_points(chart, chords.surface, end) for end in (chords.first, chords.second)]
+        sag = _points(chart, chords.surface, place) - 0.5 * (ends[0] + ends[1])
+        split = moved | (np.linalg.norm(sag, axis=1) > _DEVIATION)
+        done.append(_Chords(*(values[~split] for values in chords)))
+        if not split.any():
             break
-    done.append(chords)
+        surface, first, second = (values[split] for values in chords)
+        place = place[split]
+        chords = _Chords(
+            np.concatenate([surface, surface]),
+            np.concatenate([first, place]),
+            np.concatenate([place, second]),
+        )
+    else:
+        done.append(chords)
     return _Chords(*(np.concatenate(values) for values in zip(*done, strict=True)))
 
 
-def _kinds(part: FlatPart, chords: _Chords) -> np.ndarray:
+def _kinds(part: FlatPart, surface: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the `EdgeClass` of every chord; NONE where two fillets meet smoothly."""
     surfaces = part.surfaces
-    point = _points(surfaces, chords.surface, chords.first)
-    run = _points(surfaces, chords.surface, chords.second) - point
+    # The ends lie exactly on the edge, but may be corners; the middle lies on this edge alone.
+    run = end - start
     run /= np.maximum(np.linalg.norm(run, axis=1, keepdims=True), 1e-30)
-    normal = gradient(surfaces, chords.surface, point)
-    normal *= _side_near(part, chords.surface, point, run)[:, None]
-    kind = np.full(len(point), EdgeClass.NONE, np.uint8)
-    widest = np.full(len(point), -1.0)
-    for s in range(len(surfaces.kind)):
-        # Where does this surface pass through the edge of another one, and bound the part?
-        limits = part.surface_boxes[s]
-        close = ((point >= limits[0] - _PROBE) & (point <= limits[1] + _PROBE)).all(axis=1)
-        near = np.flatnonzero(close & (chords.surface != s))
-        other = np.full(len(near), s, np.int32)
-        touch = np.abs(distance(surfaces, other, point[near])) < _TOUCH
-        near, other = near[touch], other[touch]
-        side = _side_near(part, other, point[near], run[near])
-        near, other, side = near[side != 0], other[side != 0], side[side != 0]
-        neighbour = gradient(surfaces, other, point[near]) * side[:, None]
-        cosine = np.einsum("ij,ij->i", normal[near], neighbour)
-        angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-        fillets = surfaces.fillet[chords.surface[near]].astype(int) + surfaces.fillet[s]
-        found = np.select(
-            [angle > _SMOOTH, fillets == 1, fillets == 0],
-            [EdgeClass.SHARP, EdgeClass.FILLET, EdgeClass.SMOOTH], EdgeClass.NONE,
-        )  # fmt: skip
-        wider = angle > widest[near]
-        kind[near[wider]], widest[near[wider]] = found[wider], angle[wider]
+    middle = 0.5 * (start + end)
+    normal = gradient(surfaces, surface, middle)
+    normal *= _side_near(part, surface, middle, run)[:, None]
+    near, other = _passing(part, surface, start, middle, end)
+    side = _side_near(part, other, middle[near], run[near])
+    near, other, side = near[side != 0], other[side != 0], side[side != 0]
+    neighbour = gradient(surfaces, other, middle[near]) * side[:, None]
+    cosine = np.einsum("ij,ij->i", normal[near], neighbour)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    fillets = surfaces.fillet[surface[near]].astype(int) + surfaces.fillet[other]
+    found = np.select(
+        [angle > _SMOOTH, fillets == 1, fillets == 0],
+        [EdgeClass.SHARP, EdgeClass.FILLET, EdgeClass.SMOOTH], EdgeClass.NONE,
+    )  # fmt: skip
+    # Where three faces meet, the sharpest joint counts: it is written last.
+    order = np.argsort(angle, kind="stable")
+    kind = np.full(len(start), EdgeClass.NONE, np.uint8)
+    kind[near[order]] = found[order]
     return kind
+
+
+def _passing(
+    part: FlatPart, surface: np.ndarray, start: np.ndarray, middle: np.ndarray, end: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return chords, and for each the other surfaces that pass through an end and the middle."""
+    near, other = [], []
+    for s, limits in enumerate(part.surface_boxes):
+        close = ((middle >= limits[0] - _PROBE) & (middle <= limits[1] + _PROBE)).all(axis=1)
+        chosen = np.flatnonzero(close & (surface != s))
+        index = np.full(len(chosen), s, np.int32)
+        gaps = [np.abs(distance(part.surfaces, index, p[chosen])) for p in (start, middle, end)]
+        chosen = chosen[(np.minimum(gaps[0], gaps[2]) < _TOUCH) & (gaps[1] < 2.0 * _DEVIATION)]
+        near.append(chosen)
+        other.append(np.full(len(chosen), s, np.int32))
+    return np.concatenate(near), np.concatenate(other)
 
 
 def _side_near(

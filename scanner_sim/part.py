@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import reduce
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -25,7 +25,11 @@ if TYPE_CHECKING:
 
     from scanner_sim.scanner import View
 
-_PAD = 1e-5  # boxes are this much too large [mm], so that rounding never loses a face on their border
+    Triple: TypeAlias = Sequence[float] | np.ndarray
+
+_PAD = (
+    1e-5  # boxes are this much too large [mm], so that rounding never loses a face on their border
+)
 _MAX_DEPTH = 30  # the stack of two-bit values lives in one 64-bit word
 
 
@@ -141,25 +145,25 @@ def difference(part: Part, *others: Part) -> Part:
     return _combine(Op.DIFFERENCE, (part, *others))
 
 
-def half_space(point: Sequence[float], normal: Sequence[float]) -> Part:
+def half_space(point: Triple, normal: Triple) -> Part:
     """Return the side of a plane that its normal points away from."""
     axis = np.asarray(normal, np.float64)
     return _leaf(SurfaceKind.PLANE, point, axis)
 
 
-def sphere(center: Sequence[float], radius: float, *, fillet: bool = False) -> Part:
+def sphere(center: Triple, radius: float, *, fillet: bool = False) -> Part:
     """Return a ball [mm]."""
     return _leaf(SurfaceKind.SPHERE, center, (0, 0, 1), radius, fillet=fillet)
 
 
 def cylinder(
-    point: Sequence[float], axis: Sequence[float], radius: float, *, fillet: bool = False
+    point: Triple, axis: Triple, radius: float, *, fillet: bool = False
 ) -> Part:
     """Return an endless cylinder around an axis [mm]."""
     return _leaf(SurfaceKind.CYLINDER, point, axis, radius, fillet=fillet)
 
 
-def cone(apex: Sequence[float], axis: Sequence[float], half_angle: float) -> Part:
+def cone(apex: Triple, axis: Triple, half_angle: float) -> Part:
     """Return an endless cone that opens from its apex [mm] along the axis; half angle in rad."""
     if not 0.0 < half_angle < math.pi / 2:
         raise DataError(f"half angle of a cone must be between 0 and pi/2, not {half_angle}")
@@ -167,7 +171,12 @@ def cone(apex: Sequence[float], axis: Sequence[float], half_angle: float) -> Par
 
 
 def torus(
-    center: Sequence[float], axis: Sequence[float], ring: float, tube: float, *, fillet: bool = False
+    center: Triple,
+    axis: Triple,
+    ring: float,
+    tube: float,
+    *,
+    fillet: bool = False,
 ) -> Part:
     """Return a torus with the radii of its ring and of its tube [mm]; the tube must be thinner."""
     if not 0.0 < tube < ring:
@@ -175,7 +184,7 @@ def torus(
     return _leaf(SurfaceKind.TORUS, center, axis, ring, tube, fillet=fillet)
 
 
-def box(low: Sequence[float], high: Sequence[float]) -> Part:
+def box(low: Triple, high: Triple) -> Part:
     """Return the box between two corners [mm]."""
     sides = []
     for k in range(3):
@@ -186,7 +195,7 @@ def box(low: Sequence[float], high: Sequence[float]) -> Part:
     return intersection(*sides)
 
 
-def rod(start: Sequence[float], end: Sequence[float], radius: float) -> Part:
+def rod(start: Triple, end: Triple, radius: float) -> Part:
     """Return a cylinder with flat ends [mm]."""
     axis = np.subtract(end, start)
     return intersection(
@@ -195,7 +204,7 @@ def rod(start: Sequence[float], end: Sequence[float], radius: float) -> Part:
 
 
 def _leaf(
-    kind: SurfaceKind, point: Sequence[float], axis: Sequence[float] | np.ndarray,
+    kind: SurfaceKind, point: Triple, axis: Triple,
     a: float = 0.0, b: float = 0.0, *, fillet: bool = False,
 ) -> Part:  # fmt: skip
     direction = np.asarray(axis, np.float64)

@@ -157,9 +157,7 @@ def gradient(surfaces: Surfaces, index: np.ndarray, points: np.ndarray) -> np.nd
     return sideways[:, None] * outward + upwards[:, None] * data[:, 3:6]
 
 
-def _meridian(
-    data: np.ndarray, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _meridian(data: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return height along the axis, distance from it, and the unit vector away from it."""
     q = points - data[:, :3]
     axis = data[:, 3:6]

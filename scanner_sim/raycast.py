@@ -111,13 +111,13 @@ def _boxes(part: FlatPart) -> object:
 
 
 @ti.func
-def _vector(rows: ti.template(), i, k):  # type: ignore[no-untyped-def, valid-type]
+def _vector(rows: ti.template(), i, k):
     """Read three neighbouring columns of a row."""
     return ti.Vector([rows[i, k], rows[i, k + 1], rows[i, k + 2]])
 
 
 @ti.func
-def _distance(kind, data: ti.template(), s, p):  # type: ignore[no-untyped-def, valid-type]
+def _distance(kind, data: ti.template(), s, p):
     """Return the signed distance of a point to surface s."""
     q = p - _vector(data, s, 0)
     axis = _vector(data, s, 3)
@@ -138,8 +138,8 @@ def _distance(kind, data: ti.template(), s, p):  # type: ignore[no-untyped-def, 
 
 
 @ti.func
-def _solid_if(code: ti.template(), boxes: ti.template(), kinds: ti.template(),  # type: ignore[no-untyped-def, valid-type]
-              data: ti.template(), p, surface):  # type: ignore[no-untyped-def, valid-type]  # fmt: skip
+def _solid_if(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
+              data: ti.template(), p, surface):  # fmt: skip
     """Return two bits: is p solid if it is outside (bit 0) or inside (bit 1) of the surface?"""
     stack = ti.i64(0)
     pc = 0
@@ -183,7 +183,7 @@ def _solid_if(code: ti.template(), boxes: ti.template(), kinds: ti.template(),  
 
 
 @ti.func
-def _quadratic(a, b, c):  # type: ignore[no-untyped-def]
+def _quadratic(a, b, c):
     """Return the roots of a t^2 + 2 b t + c, without cancellation; far away when there is none."""
     roots = ti.Vector([_FAR, _FAR])
     disc = b * b - a * c
@@ -197,7 +197,7 @@ def _quadratic(a, b, c):  # type: ignore[no-untyped-def]
 
 
 @ti.func
-def _between(c3, c2, c1, c0, lead, low, high):  # type: ignore[no-untyped-def]
+def _between(c3, c2, c1, c0, lead, low, high):
     """Return the root of lead t^4 + c3 t^3 + c2 t^2 + c1 t + c0 between two signs, by halving."""
     rising = (((lead * low + c3) * low + c2) * low + c1) * low + c0 < 0.0
     for _ in range(_HALVINGS):
@@ -211,7 +211,7 @@ def _between(c3, c2, c1, c0, lead, low, high):  # type: ignore[no-untyped-def]
 
 
 @ti.func
-def _quartic(c2, c1, c0, limit):  # type: ignore[no-untyped-def]
+def _quartic(c2, c1, c0, limit):
     """Return the roots of t^4 + c2 t^2 + c1 t + c0 within the limits, between its extrema.
 
     The extrema are the roots of the derivative, found between the extrema of that one.
@@ -240,7 +240,7 @@ def _quartic(c2, c1, c0, limit):  # type: ignore[no-untyped-def]
 
 
 @ti.func
-def _crossings(kind, data: ti.template(), s, origin, direction):  # type: ignore[no-untyped-def, valid-type]
+def _crossings(kind, data: ti.template(), s, origin, direction):
     """Return where a ray crosses surface s: up to four distances, unused ones far away."""
     found = ti.Vector([_FAR, _FAR, _FAR, _FAR])
     axis = _vector(data, s, 3)
@@ -284,12 +284,14 @@ def _crossings(kind, data: ti.template(), s, origin, direction):  # type: ignore
             )
             for n in range(4):
                 if found[n] < _FAR:
-                    found[n] = start + _polished(data, s, origin + start * direction, direction, found[n])
+                    found[n] = start + _polished(
+                        data, s, origin + start * direction, direction, found[n]
+                    )
     return found
 
 
 @ti.func
-def _polished(data: ti.template(), s, origin, direction, t):  # type: ignore[no-untyped-def, valid-type]
+def _polished(data: ti.template(), s, origin, direction, t):
     """Return a root of the torus after two Newton steps on the distance itself."""
     for _ in range(2):
         q = origin + t * direction - _vector(data, s, 0)
@@ -302,6 +304,23 @@ def _polished(data: ti.template(), s, origin, direction, t):  # type: ignore[no-
         if ti.abs(slope) > 1e-6:
             t -= (tube - data[s, 7]) / slope
     return t
+
+
+@ti.func
+def _meets_box(boxes: ti.template(), b, origin, direction, reach):
+    """Say whether a ray meets box b within its reach."""
+    enter = 0.0
+    leave = reach
+    for k in ti.static(range(3)):
+        first = (boxes[b, k] - origin[k]) / direction[k]
+        second = (boxes[b, k + 3] - origin[k]) / direction[k]
+        if direction[k] == 0.0:  # parallel to these sides: between them for ever, or never
+            outer = origin[k] < boxes[b, k] or origin[k] > boxes[b, k + 3]
+            first = _FAR if outer else -_FAR
+            second = _FAR
+        enter = ti.max(enter, ti.min(first, second))
+        leave = ti.min(leave, ti.max(first, second))
+    return enter <= leave
 
 
 @ti.kernel
@@ -334,18 +353,7 @@ def _cast_rays(
             jump = code_in[pc, 2]
             pc += 1
             if op == _BOX:
-                enter = 0.0
-                leave = best
-                for k in ti.static(range(3)):
-                    first = (boxes_in[arg, k] - origin[k]) / direction[k]
-                    second = (boxes_in[arg, k + 3] - origin[k]) / direction[k]
-                    if direction[k] == 0.0:  # parallel to these sides: inside for ever, or never
-                        outer = origin[k] < boxes_in[arg, k] or origin[k] > boxes_in[arg, k + 3]
-                        first = _FAR if outer else -_FAR
-                        second = _FAR
-                    enter = ti.max(enter, ti.min(first, second))
-                    leave = ti.min(leave, ti.max(first, second))
-                if enter > leave:
+                if not _meets_box(boxes_in, arg, origin, direction, best):
                     pc = jump
             elif op == _LEAF:
                 crossings = _crossings(kinds_in[arg], data_in, arg, origin, direction)

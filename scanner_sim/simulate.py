@@ -98,6 +98,7 @@ def simulate(
         _thin(keep, exact, generators[-1])
     scans = _assemble(passes, keep, scanner, views, part, generators)
     report("truth", 0.0)
+    assert scans.stripe is not None and scans.column is not None
     truth = build_truth(
         flat,
         position=np.concatenate([p.position[k] for p, k in zip(passes, keep, strict=True)]),
@@ -137,11 +138,9 @@ def _pitches(
     across = math.sqrt(area / _TRIAL_RAYS * scanner.aspect)
     if wanted is None:
         return across, across / scanner.aspect
-    trial = [
-        _scan(flat, limits, scanner, view, across, across / scanner.aspect) for view in views
-    ]
+    trial = [_scan(flat, limits, scanner, view, across, across / scanner.aspect) for view in views]
     # Points go with the square of the fineness, ends of stripes (lost ones) only linearly.
-    points = sum(len(scan.stripe) for scan in trial)
+    points = float(sum(len(scan.stripe) for scan in trial))
     points *= (1.0 - scanner.dropout) * (1.0 - scanner.lost_stripes)
     ends = sum(len(np.unique(scan.stripe)) for scan in trial) * scanner.lost_ends
     across /= (ends + math.sqrt(ends**2 + points * wanted * _SURPLUS)) / max(points, 1.0)
@@ -174,7 +173,12 @@ def _extent(
 
 
 def _scan(
-    flat: FlatPart, limits: np.ndarray, scanner: StripeScanner, view: View, across: float, along: float
+    flat: FlatPart,
+    limits: np.ndarray,
+    scanner: StripeScanner,
+    view: View,
+    across: float,
+    along: float,
 ) -> _Pass:
     """Return every point that laser and camera both see, in scan order, without noise and losses."""
     rotation = view.rotation()

@@ -154,7 +154,9 @@ def _bridges(
     tried, bridges = 0, []
     while len(couple):
         batch = rank < tried + _LINKS
-        holds = _face_between(part, points[first[batch]], points[second[batch]], surface[first[batch]])
+        holds = _face_between(
+            part, points[first[batch]], points[second[batch]], surface[first[batch]]
+        )
         bridges.append(np.column_stack([piece[first[batch]], piece[second[batch]]])[holds])
         left = ~batch & ~np.isin(couple, couple[batch][holds])
         first, second, couple, rank = first[left], second[left], couple[left], rank[left]
