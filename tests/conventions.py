@@ -192,9 +192,7 @@ def _groups(kernel: ast.FunctionDef, lines: list[str]) -> dict[str, int]:
     return {text: number for number, text in stripped.items() if text in ("# In:", "# Out:")}
 
 
-def _atomic_rules(
-    kernel: ast.FunctionDef, parameters: list[ast.arg], path: str
-) -> list[str]:
+def _atomic_rules(kernel: ast.FunctionDef, parameters: list[ast.arg], path: str) -> list[str]:
     """Find sums of floats whose order the threads decide."""
     floats = {p.arg for p in parameters if _name(p.annotation).split(".")[-1].startswith("F")}
     found = []

@@ -49,7 +49,10 @@ def add(x):
 # What is changed in the good sample -> what the checker has to say.
 BREACHES = {
     "future": (('"""Adds one."""', '"""A."""\nfrom __future__ import annotations'), "__future__"),
-    "taichi": (("from octoseg_ti.device.runtime import F64Array, ti", "import taichi as ti"), "tak"),
+    "taichi": (
+        ("from octoseg_ti.device.runtime import F64Array, ti", "import taichi as ti"),
+        "tak",
+    ),
     "init": (("runtime.ensure_started()", "runtime.ensure_started(); ti.init()"), "ti.init"),
     "field": (("runtime.ensure_started()", "runtime.ensure_started(); ti.field(int)"), "ti.field"),
     "public": (("def _add(", "def add_one("), "starts with _"),
@@ -75,7 +78,10 @@ BREACHES = {
         "13 parameters",
     ),
     "long kernel": (
-        ("        y_out[i] = x_in[i]", "        y_out[i] = 0.0\n" * 55 + "        y_out[i] = x_in[i]"),
+        (
+            "        y_out[i] = x_in[i]",
+            "        y_out[i] = 0.0\n" * 55 + "        y_out[i] = x_in[i]",
+        ),
         "at most 60",
     ),
 }

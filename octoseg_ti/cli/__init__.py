@@ -150,7 +150,7 @@ def _flush() -> None:
 
 
 def drop_stdout() -> None:
-    """Point stdout at nothing, so that nobody writes into the closed pipe again, not even at exit."""
+    """Point stdout at nothing: nobody writes into the closed pipe again, not even at exit."""
     try:
         nothing = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nothing, sys.stdout.fileno())

@@ -22,8 +22,12 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
-from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec
-from tyro.constructors import StructTypeInfo
+from tyro.constructors import (
+    ConstructorRegistry,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
 
 from octoseg_ti.cli import UsageError, suggest
 
@@ -133,19 +137,23 @@ def _dataclass_rule(
         doc, name = docs.get(item.name, ""), item.name
         if _RADIANS.search(doc):
             name = f"{item.name}_deg"
-            angles[name] = item.name
             doc = _RADIANS.sub("[deg]", doc)
-            default = math.degrees(default) if isinstance(default, float) else default
+            shown = round(math.degrees(default), 9) if isinstance(default, float) else default
+            angles[name] = (item.name, shown, default)
+            default = shown
         hint, is_list = _plain_type(hints[item.name])
         lists += [item.name] if is_list else []
+        if not _has_option(hint) and default is not tyro.MISSING_NONPROP:
+            continue
         if default is None or default is False:  # saying so would help nobody
             hint = Annotated[hint, tyro.conf.arg(help_behavior_hint="")]
         fields.append(StructFieldSpec(name=name, type=hint, default=default, helptext=doc))
 
     def instantiate(**values: Any) -> Any:
-        for name, field in angles.items():
+        for name, (field, shown, default) in angles.items():
             value = values.pop(name)
-            values[field] = math.radians(value) if isinstance(value, float) else value
+            # The default keeps its last bit: 30 degrees there and back is another number.
+            values[field] = default if value == shown else math.radians(value)
         for name in lists:
             values[name] = tuple(Path(text) for text in values[name])
         return cls(**values)
@@ -184,6 +192,16 @@ def _plain_type(hint: Any) -> tuple[Any, bool]:
     return hint, False
 
 
+def _has_option(hint: Any) -> bool:
+    """Say whether a value of this type can be written on the command line."""
+    hint = typing.get_args(hint)[0] if typing.get_origin(hint) is Annotated else hint
+    if typing.get_origin(hint) is typing.Union:
+        return all(_has_option(part) for part in typing.get_args(hint))
+    if typing.get_origin(hint) is typing.Literal or dataclasses.is_dataclass(hint):
+        return True
+    return hint in (float, int, bool, str, Path, list, type(None))
+
+
 def _field_docs(cls: type) -> dict[str, str]:
     """Return the text below every field of a dataclass, from its source."""
     docs: dict[str, str] = {}
@@ -208,5 +226,5 @@ def _docs_of(node: ast.ClassDef) -> dict[str, str]:
             and isinstance(below.value, ast.Constant)
             and isinstance(below.value.value, str)
         ):
-            docs[field.target.id] = " ".join(below.value.value.split())
+            docs[field.target.id] = " ".join(below.value.value.replace("`", "").split())
     return docs
