@@ -164,7 +164,9 @@ def _signature_rules(
             found.append(_at(path, parameter, f"{where} has no annotation"))
             continue
         annotation = _name(parameter.annotation)
-        if not annotation:
+        if isinstance(parameter.annotation, ast.Call) and "ndarray" in _name(
+            parameter.annotation.func
+        ):
             found.append(_at(path, parameter, f"{where}: use an alias of the runtime as type"))
         if _ARRAY.match(annotation.split(".")[-1]):
             if not parameter.arg.endswith(_SUFFIX):

@@ -47,10 +47,10 @@ OPTIONS: dict[str, Any] = {"info": InfoOptions, "check": CheckOptions}
 
 def run_info(options: InfoOptions) -> int:
     """Describe every file."""
-    from octoseg_ti.files import inspect
-
     _needs_files("info", options.inputs)
     check_inputs(options.inputs)
+    from octoseg_ti.files import inspect
+
     found = {str(path): inspect.describe(path) for path in options.inputs}
     if options.json:
         out_json(next(iter(found.values())) if len(found) == 1 else found)
@@ -62,10 +62,10 @@ def run_info(options: InfoOptions) -> int:
 
 def run_check(options: CheckOptions) -> int:
     """Verify every file; a file that cannot be read is a problem like any other."""
-    from octoseg_ti.files import inspect
-
     _needs_files("check", options.inputs)
     check_inputs(options.inputs)
+    from octoseg_ti.files import inspect
+
     problems: dict[str, list[str]] = {}
     for path in options.inputs:
         try:

@@ -94,30 +94,52 @@ def _wide() -> typing.Iterator[None]:
 def _one_line(verb: str, message: str, arguments: list[str], known: list[str]) -> str:
     """Return the first paragraph of the parser's box, with a suggestion for a misspelt option."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", message)
-    lines = [line.strip("│╭╮╰╯").rstrip() for line in text.splitlines()]
-    lines = [line for line in lines if line.strip()][1:] or ["wrong arguments"]
-    first: list[str] = []
-    for line in lines:
-        if set(line.strip()) == {"─"} or line.strip().startswith("Got errors"):
-            break
-        first.append(line)
-    if first and first[0].strip().startswith("Missing from"):
+    # A box of Unicode lines with the title in its edge, or, where the terminal knows no such lines,
+    # a paragraph for the title; rules part the paragraphs.
+    paragraphs: list[list[str]] = [[]]
+    for line in text.splitlines():
+        inside = line.strip("│|").rstrip()
+        if line[:1] in "╭╰+" or not inside.strip():
+            continue
+        if set(inside.strip()) <= {"─", "-"}:
+            paragraphs.append([])
+        elif not inside.strip().startswith(("Got errors", "- <")):
+            paragraphs[-1].append(inside)
+    paragraphs = [lines for lines in paragraphs if lines] or [["wrong arguments"]]
+    first = paragraphs[0 if text[:1] == "╭" else min(1, len(paragraphs) - 1)]
+    if first[0].strip().startswith("Missing from"):
         indent = min((len(line) - len(line.lstrip()) for line in first[1:]), default=0)
         names = [line.strip() for line in first[1:] if not line[indent:].startswith(" ")]
         first = ["missing", ", ".join(re.split(r"\s{2,}", name)[0] for name in names)]
     what = " ".join(" ".join(first).split()).rstrip(".:")
+    what = re.sub(
+        r"Error parsing (\S+): no type matching (\w+) could be instantiated from \['(.*)'\]",
+        r"\1 needs \2, not '\3'",
+        what,
+    )
     given = [a.split("=")[0] for a in arguments if a.startswith("--")]
     wrong = [a for a in given if a not in known and a.replace("_", "-") not in known]
     hint = suggest(wrong[0], known) if wrong and wrong[0] in what else ""
     return f"{verb}: {what}{hint}; see octoseg {verb} --help"
 
 
-def _names(options: type) -> list[str]:
+def _names(options: type, prefix: str = "--") -> list[str]:
     """Return the long names of the options, as they are written on the command line."""
-    registry = ConstructorRegistry()
-    registry.struct_rule(lambda info: _dataclass_rule(info, options, {}))
-    parser = tyro.extras.get_parser(options, registry=registry, config=_CONFIG)
-    return [s for a in parser._actions for s in a.option_strings if s.startswith("--")]
+    names = []
+    docs = _field_docs(options)
+    for name, hint in typing.get_type_hints(options, include_extras=True).items():
+        base, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
+        dashed = prefix + name.replace("_", "-")
+        if tyro.conf.Positional in marks:
+            continue
+        if dataclasses.is_dataclass(base):
+            inner = prefix if tyro.conf.OmitArgPrefixes in marks else f"{dashed}."
+            names += _names(typing.cast(type, base), inner)
+        elif base is bool:  # which of the two there is depends on the default
+            names += [dashed, f"{prefix}no-{name.replace('_', '-')}"]
+        else:
+            names.append(dashed + "-deg" * bool(_RADIANS.search(docs.get(name, ""))))
+    return names
 
 
 def _dataclass_rule(
