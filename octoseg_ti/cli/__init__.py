@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 
 VERBS = {
@@ -101,7 +101,7 @@ def _help() -> str:
     return "\n".join(lines)
 
 
-def suggest(word: str, known: Sequence[str] | dict[str, object]) -> str:
+def suggest(word: str, known: Iterable[str]) -> str:
     """Return " (did you mean 'x'?)" for the known word that is nearest, or ""."""
     import difflib
 

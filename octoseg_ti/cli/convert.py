@@ -15,8 +15,8 @@ from octoseg_ti.errors import DataError
 if TYPE_CHECKING:
     from octoseg_ti.types import Segmentation
 
-RESULT_SUFFIXES = (".mcap", ".npz", ".ply")
-"""Formats that can hold a result that is read back."""
+RESULT_SUFFIXES = (".mcap", ".npz")
+"""Formats that keep a whole result."""
 COMPLETE = (".mcap", ".npz", ".rrd")
 """Formats that hold everything: the others keep points, normals and labels at most."""
 
@@ -73,6 +73,7 @@ def result_in(path: Path) -> Segmentation | None:
         return None
     try:
         return files.read_segmentation(path)
-    except DataError:
-        # Points alone are no fault; a damaged file has been refused when its points were read.
-        return None
+    except DataError as error:
+        if "no result" in error.what:  # points alone are no fault
+            return None
+        raise

@@ -206,7 +206,8 @@ def _plain_type(hint: Any) -> tuple[Any, bool]:
     if typing.get_origin(hint) is Annotated:
         base, *marks = typing.get_args(hint)
         base, is_list = _plain_type(base)
-        return Annotated[(base, *marks)], is_list
+        parts = (base, *marks)
+        return Annotated[parts], is_list
     if typing.get_origin(hint) is types.UnionType:
         return typing.Union[typing.get_args(hint)], False  # noqa: UP007
     if hint == tuple[Path, ...]:

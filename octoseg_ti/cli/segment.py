@@ -64,7 +64,8 @@ def preset_in(arguments: list[str]) -> Params:
             named = following
         elif here.startswith("--preset="):
             named = here.partition("=")[2]
-    return PRESETS.get(named, Params)()  # an unknown name is refused by the parser
+    preset: Any = PRESETS.get(named, Params)  # an unknown name is refused by the parser
+    return preset()  # type: ignore[no-any-return]
 
 
 def run_segment(options: SegmentOptions) -> int:
