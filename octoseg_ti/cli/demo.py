@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
@@ -12,8 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from octoseg_ti.cli import Failure
-from octoseg_ti.cli.options import Machine, make_folder
+from octoseg_ti.cli.options import Machine, make_folder, need_display
 from octoseg_ti.cli.output import out, out_json, progress, size_of
 
 OUTPUTS = ("scan.mcap", "result.mcap", "result.npz", "result.ply", "result.rrd")
@@ -68,11 +66,20 @@ def run_demo(options: DemoOptions) -> int:
         files.write(folder / "scan.mcap", scans, truth=truth)
         result = segment(scans, progress=report)
         scores = evaluate(result, truth)
-        for name in OUTPUTS[1:]:
-            report(f"write {name}")
-            files.write(folder / name, result, truth=truth, scans=scans)
         report("write the report")
         write_report(folder, result, scores=scores, truth=truth)
+        text = (folder / "report.md").read_text(encoding="utf-8")
+        for name in OUTPUTS[1:]:
+            report(f"write {name}")
+            files.write(
+                folder / name,
+                result,
+                truth=truth,
+                scans=scans,
+                report=text,
+                scores=scores.to_dict(),
+                run={"command": "octoseg demo", "seed": str(options.seed)},
+            )
     seconds = time.perf_counter() - began
     written = sorted(p for p in folder.iterdir() if p.is_file())
     if options.json:
@@ -108,9 +115,7 @@ def open_in_rerun(path: Path) -> None:
     Raises:
         Failure: There is no display.
     """
-    linux = sys.platform.startswith("linux")
-    if linux and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise Failure(f"no display to open Rerun on; {path} is written: open it elsewhere")
+    need_display(f"{path} is written: open it elsewhere")
     subprocess.Popen(
         [sys.executable, "-m", "rerun", str(path)],
         stdin=subprocess.DEVNULL,

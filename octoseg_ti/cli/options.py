@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,3 +90,17 @@ def make_folder(folder: Path) -> None:
         raise DataError(f"cannot be created ({error.strerror})", path=folder) from error
     if not os.access(folder, os.W_OK):
         raise DataError("is not writable", path=folder, hint="choose another folder")
+
+
+def need_display(instead: str) -> None:
+    """Refuse to start a viewer where none can be seen.
+
+    Args:
+        instead: What the user can do.
+
+    Raises:
+        Failure: There is no display.
+    """
+    linux = sys.platform.startswith("linux")
+    if linux and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise Failure(f"no display for the Rerun viewer; {instead}")

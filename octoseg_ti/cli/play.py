@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from octoseg_ti.cli import UsageError
 from octoseg_ti.cli.convert import result_in
-from octoseg_ti.cli.options import Machine, check_inputs, check_outputs
-from octoseg_ti.cli.output import note, out, out_json, progress, size_of
+from octoseg_ti.cli.options import Machine, check_inputs, check_outputs, need_display
+from octoseg_ti.cli.output import out, out_json, progress, size_of
 from octoseg_ti.errors import DataError
+
+if TYPE_CHECKING:
+    from octoseg_ti.types import Scans, Segmentation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,7 +28,7 @@ class PlayOptions:
     octoseg play scan.mcap --rate 1
     octoseg play scan.mcap --save scan.rrd
 
-    Without --save, --connect or --headless a viewer is started.
+    A result in the recording is shown at the end, unless only some stripes are played.
     """
 
     input: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
@@ -37,15 +42,17 @@ class PlayOptions:
     every: int = 1
     """Play every N-th stripe."""
     segment: bool = False
-    """Segment the played stripes and show the result; a recorded result is shown anyway."""
+    """Segment the played stripes, and show the result."""
+    segment_every: int = 0
+    """With --segment: not only at the end, but also after every N stripes."""
     save: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
     """Write a file for the viewer instead of opening it."""
     connect: Annotated[str | None, tyro.conf.arg(metavar="URL")] = None
     """Send to a viewer that runs at this URL, e.g. rerun+http://127.0.0.1:9876/proxy"""
     spawn: bool = False
-    """Start a viewer, also beside --save."""
+    """Start a viewer; this is what happens without --save, --connect or --headless."""
     headless: bool = False
-    """Send nowhere: checks that the recording plays."""
+    """Show nothing and keep nothing: only checks that the recording plays."""
     topic: str | None = None
     """Topic of the points, when a recording has several."""
     json: bool = False
@@ -59,19 +66,14 @@ OPTIONS = {"play": PlayOptions}
 
 
 def run_play(options: PlayOptions) -> int:
-    """Read, choose stripes, segment on request, play."""
-    lines = parse_lines(options.lines)
-    if options.every < 1:
-        raise UsageError(f"--every must be at least 1, not {options.every}")
-    if not (math.isfinite(options.rate) and options.rate >= 0):
-        raise UsageError(f"--rate must be 0 or more, not {options.rate:g}")
-    if options.loop < 0:
-        raise UsageError(f"--loop must be 0 or more, not {options.loop}")
-    if options.headless and (options.save or options.spawn or options.connect):
-        raise UsageError("--headless sends nowhere: it excludes --save, --spawn and --connect")
+    """Read, choose stripes, play, segment on request."""
+    _check(options)
     check_inputs([options.input])
     if options.save is not None:
         check_outputs([options.save], (".rrd",))
+    elsewhere = options.save or options.connect or options.headless
+    if not elsewhere:
+        need_display("--save FILE.rrd writes a file for it")
     options.machine.start()
     from octoseg_ti import files
     from octoseg_ti.view import rerun_log
@@ -83,44 +85,58 @@ def run_play(options: PlayOptions) -> int:
             path=options.input,
             hint="octoseg convert FILE OUT.rrd shows it as a whole",
         )
-    result = _result(options, scans)
-    with progress("play", quiet=options.quiet) as report:
-        figures = rerun_log.play(
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        progress("play", quiet=options.quiet) as report,
+    ):
+        played = rerun_log.play(
             scans,
             rate=options.rate,
             loop=options.loop,
-            lines=lines,
+            lines=parse_lines(options.lines),
             every=options.every,
-            save=options.save,
-            connect=options.connect,
-            spawn=_spawns(options),
-            segmentation=result,
-            progress=report,
+            save=Path(scratch) / "play.rrd" if options.headless else options.save,
+            url=options.connect,
+            spawn=not elsewhere,
+            segment=_segmenter(options),
+            segment_every=options.segment_every,
+            progress=lambda share: report("stripes", share),
         )
     if options.json:
-        out_json(figures)
+        out_json(asdict(played))
     elif not options.quiet:
-        out(", ".join(f"{key} {value}" for key, value in figures.items()))
+        late = f", at most {played.lag:.3f} s late" if options.rate else ""
+        out(f"{played.stripes} stripes, {played.points} points in {played.seconds:.2f} s{late}")
         if options.save is not None:
             out(f"wrote {options.save} ({size_of(options.save)}): rerun {options.save}")
     return 0
 
 
-def _spawns(options: PlayOptions) -> bool:
-    """Say whether a viewer is to be started."""
-    elsewhere = options.save or options.connect or options.headless
-    return options.spawn or not elsewhere
+def _check(options: PlayOptions) -> None:
+    """Refuse options that make no sense, alone or together."""
+    parse_lines(options.lines)
+    if options.every < 1:
+        raise UsageError(f"--every must be at least 1, not {options.every}")
+    if not (math.isfinite(options.rate) and options.rate >= 0):
+        raise UsageError(f"--rate must be 0 or more, not {options.rate:g}")
+    if options.loop < 0 or options.segment_every < 0:
+        raise UsageError("--loop and --segment-every must be 0 or more")
+    targets = [options.save, options.connect, options.spawn, options.headless]
+    if sum(map(bool, targets)) > 1:
+        raise UsageError("one of --save, --connect, --spawn and --headless at a time")
+    if options.loop != 1 and (options.save or options.headless):
+        raise UsageError("--loop is for viewers: a file holds one loop")
 
 
-def _result(options: PlayOptions, scans: Any) -> Any:
-    """Return the result to show: computed now, recorded, or none."""
-    if not options.segment:
-        return result_in(options.input)
-    from octoseg_ti.pipeline import segment
+def _segmenter(options: PlayOptions) -> Callable[[Scans], Segmentation] | None:
+    """Return what segments the played stripes: the method, the recorded result, or nothing."""
+    if options.segment:
+        from octoseg_ti.pipeline import segment
 
-    if not options.quiet:
-        note(f"{options.input}: segmenting it now")
-    return segment(scans)
+        return segment
+    whole = options.lines is None and options.every == 1
+    recorded = result_in(options.input) if whole else None
+    return None if recorded is None else lambda played: recorded
 
 
 def parse_lines(text: str | None) -> tuple[int, int | None] | None:

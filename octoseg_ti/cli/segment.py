@@ -88,7 +88,7 @@ def run_segment(options: SegmentOptions) -> int:
         result = segment(scans, params=options.params, progress=report)
         for path in options.output:
             report(f"write {path.name}")
-            files.write(path, result, truth=truth, scans=scans)
+            files.write(path, result, truth=truth, scans=scans, run={"command": "octoseg segment"})
     whole = time.perf_counter() - began
     if options.quiet and not options.json:
         return 0

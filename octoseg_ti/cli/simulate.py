@@ -57,7 +57,8 @@ def run_simulate(options: SimulateOptions) -> int:
     with progress("simulate", quiet=options.quiet) as report:
         scans, truth = simulate(part, options.scanner, seed=options.seed, progress=report)
         report(f"write {options.output.name}")
-        files.write(options.output, scans, truth=truth)
+        run = {"command": "octoseg simulate", "part": options.part, "seed": str(options.seed)}
+        files.write(options.output, scans, truth=truth, run=run)
     if options.json:
         figures = scan_summary(scans, truth)
         out_json({"part": options.part, "seed": options.seed, **figures, "output": options.output})

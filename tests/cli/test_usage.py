@@ -84,7 +84,8 @@ def test_every_option_has_a_help_text(verb: str) -> None:
         (["play", __file__, "--lines", "five"], ["--lines"]),
         (["play", __file__, "--every", "0"], ["--every"]),
         (["play", __file__, "--rate", "nan"], ["--rate"]),
-        (["play", __file__, "--headless", "--spawn"], ["--headless"]),
+        (["play", __file__, "--headless", "--spawn"], ["--headless", "--spawn"]),
+        (["play", __file__, "--headless", "--loop", "2"], ["--loop"]),
         (["demo", "--part", "blok"], ["no part 'blok'", "test-block"]),
     ],
 )

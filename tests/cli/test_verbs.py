@@ -171,6 +171,22 @@ def test_play_to_a_file(octoseg, recording: Path, tmp_path: Path) -> None:
     assert (tmp_path / "p.rrd").stat().st_size > 1000
 
 
+def test_play_segments_what_was_played(octoseg, recording: Path) -> None:
+    arguments = ["--headless", "--segment", "--segment-every", "20", "--json"]
+    outcome = octoseg("play", recording, *arguments)
+    assert outcome.code == 0, outcome.err
+    assert json.loads(outcome.out)["segmentations"] == 2
+
+
+def test_play_without_a_display_says_what_to_do(octoseg, recording: Path, monkeypatch) -> None:
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    outcome = octoseg("play", recording)
+    assert outcome.code == 1
+    assert "--save" in outcome.complaint
+
+
 def test_play_headless_keeps_the_pace(octoseg, recording: Path) -> None:
     # 40 stripes, 20 ms apart, at 4 times the speed: 0.2 s.
     outcome = octoseg("play", recording, "--headless", "--rate", "4", "--json")
