@@ -122,15 +122,23 @@ def test_results_do_not_depend_on_the_number_of_threads(recording: Path, tmp_pat
         np.testing.assert_array_equal(a[name], b[name])
 
 
-def test_no_home_folder_for_the_cache_is_no_obstacle(recording: Path, tmp_path: Path) -> None:
+def test_cache_of_kernels_can_be_moved(recording: Path, tmp_path: Path) -> None:
     environment = {**os.environ, "OCTOSEG_CACHE": str(tmp_path / "kernels")}
     done = subprocess.run(
-        [sys.executable, "-m", "octoseg_ti", "segment", str(recording), "-o", "a.npz", "--quiet"],
-        cwd=tmp_path,
+        [
+            sys.executable,
+            "-m",
+            "octoseg_ti",
+            "segment",
+            recording,
+            "-o",
+            tmp_path / "a.npz",
+            "--quiet",
+        ],
         env=environment,
         capture_output=True,
         text=True,
         timeout=120,
     )
     assert (done.returncode, done.stderr) == (0, "")
-    assert any((tmp_path / "kernels").rglob("*.tic")) or any((tmp_path / "kernels").iterdir())
+    assert any((tmp_path / "kernels").rglob("*"))
