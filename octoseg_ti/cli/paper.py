@@ -248,7 +248,7 @@ def comparison(found: list[dict[str, Any]], sweep: list[dict[str, Any]]) -> str:
         [[row["title"], *row["user_values"].values()] for row in found],
     )
     legend = (
-        "here: ours, beside the published figure on its left; iterations in the second table, counts "
-        "and user values are ours too"
+        "here: ours, beside the published figure on its left; iterations in the second table, "
+        "counts and user values are ours too"
     )
     return "\n\n".join([times, counts, steps, values, legend])
