@@ -43,7 +43,8 @@ class Example:
     """Published number of cell sizes; None = not given."""
     params: Params
     """The user values. Published ones where the paper gives them: tolerance 0.01; phone: 12
-    divisions, 4 smallest levels sharp, the next 2 fillets; block: 6 smallest levels of 9."""
+    divisions, 4 smallest levels sharp, the next 2 fillets. The rest is chosen for our scans; the
+    paper removed the 6 smallest of 9 levels of its block."""
 
 
 EXAMPLES = (
@@ -55,7 +56,7 @@ EXAMPLES = (
         grid_seconds=10.0,
         segmentation_seconds=20.0,
         levels=None,
-        params=paper(divisions=12, smallest_levels=4, homogeneity=math.radians(10.0)),
+        params=paper(divisions=4, smallest_levels=3, homogeneity=math.radians(8.0), min_points=100),
     ),
     Example(
         part="test-block",
@@ -65,7 +66,7 @@ EXAMPLES = (
         grid_seconds=32.0,
         segmentation_seconds=40.0,
         levels=9,
-        params=paper(divisions=12, smallest_levels=6, homogeneity=math.radians(10.0)),
+        params=paper(divisions=16, smallest_levels=5, homogeneity=math.radians(8.0)),
     ),
     Example(
         part="phone",

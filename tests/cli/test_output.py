@@ -44,7 +44,8 @@ def test_json_of_numpy_and_infinities(capsys) -> None:
 
 @given(
     st.recursive(
-        st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+        # No subnormal numbers: where Taichi runs, the processor takes them for zero.
+        st.none() | st.booleans() | st.integers() | st.floats(allow_subnormal=False) | st.text(),
         lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
     )
 )
