@@ -116,9 +116,13 @@ def _sum_turns(
                     count = 1.0 / (node_in[c, HI] - node_in[c, LO])
                     count += 1.0 / (node_in[b, HI] - node_in[b, LO])
                     # What the noise of the mean normals adds is taken off, also where that leaves
-                    # less than nothing: the sum over the pairs is right.
-                    turn = ti.cast(ti.round(((n - m).norm_sqr() - variance * count) * _ONE), ti.i64)
-                    far = ti.cast(ti.round(d.norm_sqr() / (finest * finest) * _ONE), ti.i64)
+                    # less than nothing: the sum over the pairs is right. Every pair has one vote
+                    # on the curvature, or large cells would drown the bend beside them.
+                    square = d.norm_sqr() / (finest * finest)
+                    weight = 1.0 / ti.max(1.0, square)
+                    change = weight * ((n - m).norm_sqr() - variance * count)
+                    turn = ti.cast(ti.round(change * _ONE), ti.i64)
+                    far = ti.cast(ti.round(weight * square * _ONE), ti.i64)
                     ti.atomic_add(sum_inout[c, 0], turn)
                     ti.atomic_add(sum_inout[c, 1], far)
                     ti.atomic_add(sum_inout[b, 0], turn)
