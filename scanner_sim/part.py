@@ -156,9 +156,7 @@ def sphere(center: Triple, radius: float, *, fillet: bool = False) -> Part:
     return _leaf(SurfaceKind.SPHERE, center, (0, 0, 1), radius, fillet=fillet)
 
 
-def cylinder(
-    point: Triple, axis: Triple, radius: float, *, fillet: bool = False
-) -> Part:
+def cylinder(point: Triple, axis: Triple, radius: float, *, fillet: bool = False) -> Part:
     """Return an endless cylinder around an axis [mm]."""
     return _leaf(SurfaceKind.CYLINDER, point, axis, radius, fillet=fillet)
 
