@@ -29,9 +29,9 @@ _SPLITS = 9
 _ASIDE = (0.6, 1.2)
 """How far beside a chord its edge is looked for, in lengths of the chord: a corner of 53 degrees
 is as far away as the chord is long."""
-_HALVINGS = 34
+_HALVINGS = 18  # from a cell's size to some nanometres
 _PROBE = 0.02  # the neighbour of a face is looked for this far from the edge [mm]
-_TOUCH = 1e-6  # a surface this close to a point of an edge passes through it [mm]
+_TOUCH = 1e-5  # a surface this close to a point of an edge passes through it [mm]
 _SAMPLE = 0.04  # spacing of the places by which the nearest edge is looked up [mm]
 _SMOOTH = math.radians(5.0)  # faces that meet at a smaller angle meet smoothly
 
@@ -291,15 +291,15 @@ def _follow(chart: _Chart, chords: _Chords) -> _Chords:
             chart, chords.surface, middle - near
         )
         moved = np.zeros(len(bent), bool)
-        place = middle.copy()
+        low, high = middle.copy(), middle.copy()
         for share in _ASIDE:
-            left = np.flatnonzero(bent)
-            low, high = middle[left] + share * aside[left], middle[left] - share * aside[left]
-            left_surface = chords.surface[left]
-            open_ = _side(chart, left_surface, low) != _side(chart, left_surface, high)
-            place[left[open_]] = _halve(chart, left_surface[open_], low[open_], high[open_])
-            moved[left[open_]] = True
-            bent[left[open_]] = False
+            left = np.flatnonzero(bent & ~moved)
+            low[left] = middle[left] + share * aside[left]
+            high[left] = middle[left] - share * aside[left]
+            on = chords.surface[left]
+            moved[left] = _side(chart, on, low[left]) != _side(chart, on, high[left])
+        place = middle.copy()
+        place[moved] = _halve(chart, chords.surface[moved], low[moved], high[moved])
         # Straight in the parameters may still be an arc in space.
         ends = [_points(chart, chords.surface, end) for end in (chords.first, chords.second)]
         sag = _points(chart, chords.surface, place) - 0.5 * (ends[0] + ends[1])

@@ -27,9 +27,7 @@ if TYPE_CHECKING:
 
     Triple: TypeAlias = Sequence[float] | np.ndarray
 
-_PAD = (
-    1e-5  # boxes are this much too large [mm], so that rounding never loses a face on their border
-)
+_PAD = 1e-5  # boxes are this much too large [mm]: rounding never loses a face on their border
 _MAX_DEPTH = 30  # the stack of two-bit values lives in one 64-bit word
 
 

@@ -166,7 +166,7 @@ def _bridges(faces: _Faces, piece: np.ndarray, reach: float) -> np.ndarray:
     face[piece] = surface
     pieces = np.bincount(face, minlength=len(part.surfaces.kind))
     open_ = np.flatnonzero((pieces[surface] > 1) & ~part.surfaces.fillet[surface])
-    cell = np.floor((points[open_] - points.min(axis=0)) / (reach / 4)).astype(np.int64)
+    cell = np.floor((points[open_] - points.min(axis=0)) / (reach / 3)).astype(np.int64)
     extent = cell.max(axis=0, initial=0) + 1
     key = np.ravel_multi_index(tuple(cell.T), tuple(extent)) + extent.prod() * piece[open_]
     kept = open_[np.unique(key, return_index=True)[1]]

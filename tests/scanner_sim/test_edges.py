@@ -101,7 +101,7 @@ def test_oblique_parts_have_oblique_edges() -> None:
 
 
 def _rounded_block() -> Part:
-    """A block with one rounded edge, along y at x = 5, z = 4, and a round key with a rounded rim."""
+    """A block with a rounded edge, along y at x = 5, z = 4, and a key with a rounded rim."""
     cut = intersection(
         half_space((4, 0, 0), (-1, 0, 0)), half_space((0, 0, 3), (0, 0, -1)),
         outside(cylinder((4, 0, 3), (0, 1, 0), 1.0, fillet=True)),
