@@ -274,18 +274,18 @@ def grow_regions(
     number = number_groups(grid, group, min_points)
     doubtful = (strips(grid, group) | bend) & (number >= 0)
     cell_label = np.where(doubtful, NONE, number)
-    label = assign_points(grid, leaves, cell_label, bend=bend, **fit)
     if doubtful.any():
-        claimed = claimed_share(grid, leaves, label, np.where(doubtful, number, NONE))
+        judged = assign_points(grid, leaves, cell_label, bend=bend, only=doubtful | bend, **fit)
+        claimed = claimed_share(grid, leaves, judged, np.where(doubtful, number, NONE))
         dropped = np.append(claimed > _CLAIMED, True)
         group[doubtful & dropped[number]] = NONE
         bends = np.flatnonzero(bend & (group >= 0))
         cells = np.full(grid.count, NONE, np.int32)
         cells[bends] = np.arange(len(bends), dtype=np.int32)
-        flush = bends[claimed_share(grid, leaves, label, cells) > _CLAIMED]
+        flush = bends[claimed_share(grid, leaves, judged, cells) > _CLAIMED]
         group[flush] = NONE
         cell_label = number_groups(grid, group, min_points)
-        label = assign_points(grid, leaves, cell_label, bend=bend, **fit)
+    label = assign_points(grid, leaves, cell_label, bend=bend, **fit)
     return cell_label, label
 
 
@@ -321,10 +321,12 @@ def assemble(
     labels[row], outlier[row] = label, 0
     edges[row] = points_of_leaves(grid, leaves, edge)
     levels[row] = points_of_leaves(grid, leaves, node[leaves, LEVEL].astype(np.int8))
-    normals, points = np.zeros((n, 3), np.float32), np.full((n, 3), np.nan)
-    normals[arranged.row], points[arranged.row] = normal, point
-    left_out = np.flatnonzero(outlier)
-    if len(left_out):
+    if arranged.whole:
+        normals, points = normal.astype(np.float32), point
+    else:
+        normals, points = np.zeros((n, 3), np.float32), np.full((n, 3), np.nan)
+        normals[arranged.row], points[arranged.row] = normal, point
+        left_out = np.flatnonzero(outlier)
         points[left_out] = scans_in_world(scans, left_out)
     mean = runtime.download(grid.mean)[leaves]
     cells = Cells(

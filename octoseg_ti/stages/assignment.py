@@ -91,6 +91,7 @@ def assign_points(
     limit: float,
     tight: float,
     angle: float,
+    only: np.ndarray | None = None,
 ) -> np.ndarray:
     """Give the points without a label to the patch whose surface they lie on.
 
@@ -103,6 +104,7 @@ def assign_points(
         reach: How far to look in the first round [mm], about the smallest cell.
         limit: Largest distance of a point from the mean plane of the cell whose patch it joins [mm].
         tight: Largest distance from the plane on a bend where the normals do not agree [mm].
+        only: Nodes whose points are looked at, shape (M,), bool; None = all.
         angle: Largest angle between the normals of a bend and of the cell whose patch it joins [rad].
 
     Returns:
@@ -114,8 +116,11 @@ def assign_points(
         return label
     bend_of = points_of_leaves(grid, leaves, np.where(bend[leaves], leaves, NONE).astype(np.int32))
     device_cell = runtime.upload(cell_label.astype(np.int32))
+    asked = label < 0
+    if only is not None:
+        asked &= points_of_leaves(grid, leaves, only[leaves])
     for r in range(1, _ROUNDS + 1):
-        todo = np.flatnonzero(label < 0).astype(np.int32)
+        todo = np.flatnonzero(asked & (label < 0)).astype(np.int32)
         if len(todo) == 0:
             break
         device_label = runtime.upload(label)

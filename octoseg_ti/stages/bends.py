@@ -201,7 +201,10 @@ def split_at_bends(
     suspects = _suspects(group, count, mean[:, NORMAL : NORMAL + 3], 2 * min_points, flat)
     if not suspects:
         return result
-    turn = turning(grid, group, noise)
+    named = np.full(grid.count, NONE, np.int32)
+    for name, cells in suspects.items():
+        named[cells] = name
+    turn = turning(grid, named, noise)
     while suspects:
         straight = {}
         for name, cells in suspects.items():

@@ -219,8 +219,9 @@ def edge_pair_normals(
             )
     if origin is None:
         reference = np.zeros((views, 3))
-        for v in range(views):
-            reference[v] = points[view == v].mean(axis=0) if np.any(view == v) else 0.0
+        count = np.maximum(np.bincount(view, minlength=views), 1)
+        for k in range(3):
+            reference[:, k] = np.bincount(view, weights=points[:, k], minlength=views) / count
     else:
         reference = np.asarray(origin, np.float64)
     vote = runtime.zeros(views, np.int32)
