@@ -207,11 +207,14 @@ def split_at_bends(
     for name, cells in suspects.items():
         named[cells] = name
     turn = turning(grid, touching, named, noise)
+    # The highest valley may only part the worst cells from the rest: then the next one below it.
+    bound = dict.fromkeys(suspects, np.inf)
     while suspects:
         straight = {}
         for name, cells in suspects.items():
-            limit = _valley(turn[cells], count[cells])
-            kept = turn[cells] <= limit
+            below = turn[cells] <= bound[name]
+            bound[name] = _valley(turn[cells[below]], count[cells[below]])
+            kept = turn[cells] <= bound[name]
             if not kept.all() and count[cells[kept]].sum() >= _COVERAGE * count[cells].sum():
                 straight[name] = cells[kept]
         if not straight:
@@ -247,20 +250,24 @@ def split_at_bends(
                 narrow = min(narrow, _APART * float(faces[1].min()))
             else:
                 takes_part[cells] = False
+        suspects = {name: suspects[name] for name in straight if name not in cut}
         if not cut:
-            break
+            continue
         pieces = flood_fill(
             grid, touching, takes_part, homogeneity=narrow, chord=chord, slack=slack
         )
-        suspects = {}
-        for cells in cut.values():
+        for name, cells in cut.items():
             sizes = np.bincount(pieces[cells] + 1, weights=count[cells])[1:]
             if sizes.max() > _WHOLE * count[cells].sum():
-                continue  # the rims closed the gaps again: it is one face
+                suspects[name] = cells  # the rims closed the gaps again
+                continue
             result[cells] = pieces[cells]
             normal = mean[cells, NORMAL : NORMAL + 3]
-            again = _suspects(pieces[cells], count[cells], normal, 2 * min_points, flat)
-            suspects.update({name: cells[part] for name, part in again.items()})
+            for piece, part in _suspects(
+                pieces[cells], count[cells], normal, 2 * min_points, flat
+            ).items():
+                suspects[piece] = cells[part]
+                bound[piece] = np.inf
     return result
 
 
