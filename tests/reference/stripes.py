@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from statistics import NormalDist
 
 import numpy as np
 
@@ -69,8 +70,6 @@ def stripe_noise(
     points: np.ndarray, normals: np.ndarray, start: np.ndarray, gap: float
 ) -> tuple[float, float]:
     """Return range noise [mm] and noise of the normals [rad] from second differences."""
-    from scipy import stats
-
     second, tilt = [], []
     for stripe in runs(start):
         for i in stripe:
@@ -86,12 +85,21 @@ def stripe_noise(
                 if m.any() and n.any() and np.linalg.norm(points[i - 3] - points[i + 3]) <= 6 * gap:
                     tilt.append(float(np.linalg.norm(normals[i] - (m + n) / 2)))
     # Expected trimmed means of the distributions that pure noise of unit size would give.
-    half_normal = stats.halfnorm.expect(lb=0, ub=stats.halfnorm.ppf(0.75), conditional=True)
-    rayleigh = stats.rayleigh.expect(lb=0, ub=stats.rayleigh.ppf(0.75), conditional=True)
+    normal, q = NormalDist(), NormalDist().inv_cdf(0.875)  # three quarters lie within -q..q
+    half_normal = 2 * (normal.pdf(0) - normal.pdf(q)) / 0.75
+    q = math.sqrt(-2 * math.log(0.25))  # three quarters of a Rayleigh variable lie below q
+    rayleigh = (math.sqrt(math.pi / 2) * math.erf(q / math.sqrt(2)) - q * 0.25) / 0.75
     # A difference a - 2 p + b has 1 + 4 + 1 variances; n - (m + n) / 2 has 1 + 1/4 + 1/4.
     noise = lower_three_quarters(second) / half_normal / math.sqrt(6)
     component = lower_three_quarters(tilt) / rayleigh / math.sqrt(1.5)
     return noise, component * math.sqrt(2)
+
+
+def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return the cross product, written out."""
+    return np.array(
+        [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+    )
 
 
 def strip_triangles(
@@ -112,8 +120,8 @@ def strip_triangles(
             y_2 = float((second[a + 1] - second[a]) @ axis)
             case = 1 if y_1 <= y_2 else 2
         else:
-            diagonal_1 = np.linalg.norm(first[b + 1] - second[a])
-            diagonal_2 = np.linalg.norm(second[a + 1] - first[b])
+            diagonal_1 = math.dist(first[b + 1], second[a])
+            diagonal_2 = math.dist(second[a + 1], first[b])
             case = 1 if diagonal_1 <= diagonal_2 else 2
         if case == 1:  # Fig. 5a: the second edge becomes the next first edge
             triangles.append((a, b, (0, b + 1)))
@@ -151,13 +159,13 @@ def edge_pair_normals(
         ):
             corners = (two[a], one[b], (one, two)[line][place])
             p, q, r = (points[c] for c in corners)
-            if max(np.linalg.norm(p - q), np.linalg.norm(q - r), np.linalg.norm(r - p)) > gap:
+            if max(math.dist(p, q), math.dist(q, r), math.dist(r, p)) > gap:
                 continue
-            n = np.cross(q - p, r - p)
+            n = cross(q - p, r - p)
             if weight == "unit":
-                size = np.linalg.norm(n)
+                size = math.hypot(*n)
                 # Three points on a line have no normal.
-                flat = size <= 1e-12 * np.linalg.norm(q - p) * np.linalg.norm(r - p)
+                flat = size <= 1e-12 * math.dist(p, q) * math.dist(p, r)
                 n = np.zeros(3) if flat else n / size
             for c in corners:
                 total[c] += n
