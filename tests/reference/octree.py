@@ -60,6 +60,14 @@ def statistics(
     return direction, mean_point, sigma, math.sqrt(np.mean(offsets**2))
 
 
+def cells_along(extent: float, size: float) -> int:
+    """Return the smallest number of cells, at least one, that cover a length but for rounding."""
+    cells = 1
+    while cells * size < extent * (1 - 1e-12):
+        cells += 1
+    return cells
+
+
 def layout(
     extent: np.ndarray, divisions: int | None, min_cell: float
 ) -> tuple[float, tuple[int, ...], int]:
@@ -68,9 +76,9 @@ def layout(
         size = float(extent[extent > 1e-9 * extent.max()].min()) / divisions
     else:
         size = 16.0 * min_cell
-        while math.prod(math.floor(e / size) + 1 for e in extent) > 2**21:
+        while math.prod(cells_along(e, size) for e in extent) > 2**21:
             size *= 2.0
-    shape = tuple(math.floor(e / size) + 1 for e in extent)
+    shape = tuple(cells_along(e, size) for e in extent)
     bits = max(1, (max(shape) - 1).bit_length())
     depth = KEY_BITS - bits
     if min_cell > 0:
