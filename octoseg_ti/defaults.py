@@ -7,9 +7,11 @@ from dataclasses import replace
 from octoseg_ti.params import Params
 from octoseg_ti.types import Measurement
 
-LEAST_TOLERANCE = 0.055
-"""Deviation of the normals below which a cell counts as flat even on perfect data. By the law
-s = sqrt(6) tolerance r a sphere of 13 spacings radius then fills a smallest cell of 1.8 spacings."""
+LEAST_TOLERANCE = 0.03
+"""Deviation of the normals below which a cell counts as flat even on perfect data: 1.7 degrees."""
+LEAST_EDGE_TOLERANCE = 0.055
+"""... and below which a smallest cell is no edge. By the law s = sqrt(6) tolerance r a sphere of 13
+spacings radius fills a smallest cell of 1.8 spacings with this deviation."""
 NOISE_FLOORS = 2.0
 """The tolerance stands this many noise floors of the normals above zero."""
 CELL_SPACINGS = 1.8
@@ -53,12 +55,14 @@ def derive(params: Params, measured: Measurement) -> Params:
     if grid.tolerance is None:
         floor = NOISE_FLOORS * measured.normal_noise
         grid = replace(grid, tolerance=min(1.0, max(LEAST_TOLERANCE, floor)))
+    if grid.edge_tolerance is None:
+        grid = replace(grid, edge_tolerance=max(LEAST_EDGE_TOLERANCE, grid.tolerance or 0.0))
     if grid.min_cell is None:
         grid = replace(grid, min_cell=CELL_SPACINGS * spacing)
-    assert grid.tolerance is not None and grid.min_cell is not None
+    assert grid.tolerance is not None and grid.edge_tolerance is not None
     if regions.homogeneity is None:
         times, least, most = HOMOGENEITY
-        angle = min(most, max(least, times * grid.tolerance))
+        angle = min(most, max(least, times * grid.edge_tolerance))
         regions = replace(regions, homogeneity=angle)
     if regions.min_points is None:
         area = PATCH_CELLS * (CELL_SPACINGS * spacing) ** 2

@@ -48,6 +48,9 @@ class GridParams:
     times the smallest cell."""
     tolerance: float | None = None
     """Largest deviation of the normals in a cell (Eq. 4), 0..1; default: from the noise of the normals."""
+    edge_tolerance: float | None = None
+    """Largest deviation of the normals in a smallest cell that is no edge; default: from the noise
+    and the spacing. Below ``tolerance`` it has no effect."""
     min_cell: float | None = None
     """Smallest cell [mm]; default: from the spacing. 0 = no limit."""
     min_points: int = 3
@@ -131,7 +134,13 @@ def paper(
     return Params(
         cleaning=CleaningParams(enabled=False),
         normals=NormalParams(rule="paper"),
-        grid=GridParams(divisions=divisions, tolerance=tolerance, min_cell=0.0, min_points=2),
+        grid=GridParams(
+            divisions=divisions,
+            tolerance=tolerance,
+            edge_tolerance=tolerance,
+            min_cell=0.0,
+            min_points=2,
+        ),
         edges=EdgeParams(rule="levels", smallest_levels=smallest_levels, fillet_levels=fillet_levels),
         regions=RegionParams(homogeneity=homogeneity, min_points=min_points, assign_edges=False),
     )

@@ -207,6 +207,7 @@ def subdivide(
         point,
         normal,
         tolerance=params.grid.tolerance,
+        edge_tolerance=params.grid.edge_tolerance,
         divisions=params.grid.divisions,
         min_cell=params.grid.min_cell,
         min_points=params.grid.min_points,
@@ -236,11 +237,11 @@ def grow_regions(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the label of every node, -1 for edge cells and small groups, and of every sorted point."""
     assert params.regions.homogeneity is not None and params.regions.min_points is not None
-    assert params.grid.tolerance is not None
+    assert params.grid.edge_tolerance is not None
     literal = params.edges.rule == "levels"
     rule = {
         "homogeneity": params.regions.homogeneity,
-        "chord": float("inf") if literal else _CHORD * params.grid.tolerance,
+        "chord": float("inf") if literal else _CHORD * params.grid.edge_tolerance,
         "slack": 3.0 * measured.noise,
     }
     takes_part = np.zeros(grid.count, bool)
@@ -255,7 +256,7 @@ def grow_regions(
         grid,
         whole,
         min_points=min_points,
-        flat=params.grid.tolerance,
+        flat=params.grid.edge_tolerance,
         noise=measured.normal_noise,
         **rule,
     )
@@ -265,7 +266,7 @@ def grow_regions(
         "reach": finest,
         "limit": _JOIN_CELLS * finest + 3.0 * measured.noise,
         "tight": _LIE_CELLS * finest + 3.0 * measured.noise,
-        "angle": _BEND_TOLERANCES * params.grid.tolerance,
+        "angle": _BEND_TOLERANCES * params.grid.edge_tolerance,
     }
     # Groups that larger ones explain are no patches: strips along an edge, and bends that are as
     # flat as the face beside them. What is left of them stands for itself.

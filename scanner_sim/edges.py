@@ -3,7 +3,8 @@
 Every surface has parameters (u, v). On a grid of them the part says where the surface bounds it.
 Between a node on the boundary and one off it the face ends; halving finds the place exactly, in
 every cell two such places make a chord, and chords are split until they follow the edge. So no
-scan and no direction of view is involved, and joints where faces touch smoothly are found like any other.
+scan and no direction of view is involved, and joints where faces touch smoothly are found like any
+other.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ _MARGIN = 0.05  # the grid reaches this far beyond the faces [mm], so that every
 _DEVIATION = 0.002  # chords are split until they follow the edge this closely [mm]
 _SPLITS = 9
 _ASIDE = (0.6, 1.2)
-"""How far beside a chord its edge is looked for, in lengths of the chord: a corner of 53 degrees is as
-far away as the chord is long."""
-_HALVINGS = 34
+"""How far beside a chord its edge is looked for, in lengths of the chord: a corner of 53 degrees
+is as far away as the chord is long."""
+_HALVINGS = 18  # from a cell's size to some nanometres
 _PROBE = 0.02  # the neighbour of a face is looked for this far from the edge [mm]
-_TOUCH = 1e-6  # a surface this close to a point of an edge passes through it [mm]
+_TOUCH = 1e-5  # a surface this close to a point of an edge passes through it [mm]
 _SAMPLE = 0.04  # spacing of the places by which the nearest edge is looked up [mm]
 _SMOOTH = math.radians(5.0)  # faces that meet at a smaller angle meet smoothly
 
@@ -95,8 +96,8 @@ def nearest_edge(edges: Edges, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
     if len(edges.kind) == 0:
         return np.full(len(points), math.inf), np.full(len(points), EdgeClass.NONE, np.uint8)
     span = edges.end - edges.start
-    # The nearest of dense samples names the piece to measure to; two of them, because around a corner
-    # the nearest sample may lie on the wrong side.
+    # The nearest of dense samples names the piece to measure to; two of them, because around a
+    # corner the nearest sample may lie on the wrong side.
     counts = np.ceil(np.linalg.norm(span, axis=1) / _SAMPLE).astype(np.int64).clip(1)
     owner = np.repeat(np.arange(len(span)), counts)
     place = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -144,8 +145,8 @@ def _corners(limits: np.ndarray) -> np.ndarray:
 def _points(chart: _Chart, index: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Return positions [mm], shape (N, 3), from scaled parameters, shape (N, 2).
 
-    u is a coordinate of a plane, else the angle about the axis; v is the other coordinate, the height
-    (cylinder, cone), the latitude (sphere), or the angle about the tube (torus).
+    u is a coordinate of a plane, else the angle about the axis; v is the other coordinate, the
+    height (cylinder, cone), the latitude (sphere), or the angle about the tube (torus).
     """
     kind, data = chart.part.surfaces.kind[index], chart.part.surfaces.data[index]
     u, v = (place / chart.scale[index]).T
@@ -206,8 +207,8 @@ def _border(
     """Return the crossings of all grid lines with borders of faces, and the chords between them.
 
     Returns:
-        surface, shape (X,); the two nodes around every crossing, shapes (X, 2); the numbers of the two
-        crossings of every chord, shapes (D,).
+        surface, shape (X,); the two nodes around every crossing, shapes (X, 2); the numbers of the
+        two crossings of every chord, shapes (D,).
     """
     kinds = chart.part.surfaces.kind
     grids = [_grid(chart, s) for s in range(len(kinds))]
@@ -236,7 +237,7 @@ def _border(
 
 
 def _close(kind: int, sides: np.ndarray) -> None:
-    """Give the two ends of a full turn the same sides, in place: rounding must not open the seam."""
+    """Give both ends of a full turn the same sides, in place: rounding must not open the seam."""
     if kind != SurfaceKind.PLANE:
         sides[-1] = sides[0]
     if kind == SurfaceKind.TORUS:
@@ -246,7 +247,7 @@ def _close(kind: int, sides: np.ndarray) -> None:
 def _march(
     place: np.ndarray, sides: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the crossings of one grid, as pairs of nodes, and the chords, as pairs of crossings."""
+    """Return the crossings of a grid, as pairs of nodes, and the chords, as pairs of crossings."""
     cross_u = sides[1:] != sides[:-1]
     cross_v = sides[:, 1:] != sides[:, :-1]
     number_u = np.where(cross_u, np.cumsum(cross_u).reshape(cross_u.shape) - 1, -1)
@@ -290,15 +291,15 @@ def _follow(chart: _Chart, chords: _Chords) -> _Chords:
             chart, chords.surface, middle - near
         )
         moved = np.zeros(len(bent), bool)
-        place = middle.copy()
+        low, high = middle.copy(), middle.copy()
         for share in _ASIDE:
-            left = np.flatnonzero(bent)
-            low, high = middle[left] + share * aside[left], middle[left] - share * aside[left]
-            left_surface = chords.surface[left]
-            open_ = _side(chart, left_surface, low) != _side(chart, left_surface, high)
-            place[left[open_]] = _halve(chart, left_surface[open_], low[open_], high[open_])
-            moved[left[open_]] = True
-            bent[left[open_]] = False
+            left = np.flatnonzero(bent & ~moved)
+            low[left] = middle[left] + share * aside[left]
+            high[left] = middle[left] - share * aside[left]
+            on = chords.surface[left]
+            moved[left] = _side(chart, on, low[left]) != _side(chart, on, high[left])
+        place = middle.copy()
+        place[moved] = _halve(chart, chords.surface[moved], low[moved], high[moved])
         # Straight in the parameters may still be an arc in space.
         ends = [_points(chart, chords.surface, end) for end in (chords.first, chords.second)]
         sag = _points(chart, chords.surface, place) - 0.5 * (ends[0] + ends[1])
@@ -364,7 +365,7 @@ def _passing(
 def _side_near(
     part: FlatPart, surface: np.ndarray, point: np.ndarray, run: np.ndarray
 ) -> np.ndarray:
-    """Return on which side of its surface the part lies, close to a point of an edge; 0 = it does not.
+    """Return on which side of its surface the part lies, close to a point of an edge; 0 = none.
 
     Args:
         part: The solid.

@@ -27,9 +27,7 @@ if TYPE_CHECKING:
 
     Triple: TypeAlias = Sequence[float] | np.ndarray
 
-_PAD = (
-    1e-5  # boxes are this much too large [mm], so that rounding never loses a face on their border
-)
+_PAD = 1e-5  # boxes are this much too large [mm]: rounding never loses a face on their border
 _MAX_DEPTH = 30  # the stack of two-bit values lives in one 64-bit word
 
 
@@ -156,9 +154,7 @@ def sphere(center: Triple, radius: float, *, fillet: bool = False) -> Part:
     return _leaf(SurfaceKind.SPHERE, center, (0, 0, 1), radius, fillet=fillet)
 
 
-def cylinder(
-    point: Triple, axis: Triple, radius: float, *, fillet: bool = False
-) -> Part:
+def cylinder(point: Triple, axis: Triple, radius: float, *, fillet: bool = False) -> Part:
     """Return an endless cylinder around an axis [mm]."""
     return _leaf(SurfaceKind.CYLINDER, point, axis, radius, fillet=fillet)
 

@@ -1,9 +1,9 @@
 """The surfaces that bound a part: plane, sphere, cylinder, cone, and the torus of filleted rims.
 
-All five are surfaces of revolution (the plane aside), so one record holds them: a point, an axis and
-two lengths, in the same order as `octoseg_ti.types.Segmentation.parameters`. The quadrics are kept in
-this geometric form instead of ten coefficients: the implicit function is then a true distance,
-and rays near a small radius far from the origin keep their digits.
+All five are surfaces of revolution (the plane aside), so one record holds them: a point, an axis
+and two lengths, in the same order as `octoseg_ti.types.Segmentation.parameters`. The quadrics are
+kept in this geometric form instead of ten coefficients: the implicit function is then a true
+distance, and rays near a small radius far from the origin keep their digits.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Surface:
     axis: tuple[float, float, float]
     """Unit normal of a plane (points to the outside), else the axis; a cone opens along it."""
     a: float = 0.0
-    """Radius of a cylinder or sphere, radius of the ring of a torus [mm], half angle of a cone [rad]."""
+    """Radius of a cylinder, a sphere or the ring of a torus [mm], half angle of a cone [rad]."""
     b: float = 0.0
     """Radius of the tube of a torus [mm]."""
     fillet: bool = False
@@ -52,7 +52,7 @@ class Surface:
         )  # fmt: skip
 
     def box(self) -> np.ndarray:
-        """Return the axis-aligned box of the inside [mm], shape (2, 3); unbounded sides are infinite."""
+        """Return the axis-aligned box of the inside [mm], shape (2, 3); may be infinite."""
         point, axis = np.array(self.point), np.array(self.axis)
         low, high = np.full(3, -math.inf), np.full(3, math.inf)
         if self.kind == SurfaceKind.SPHERE:
@@ -129,7 +129,8 @@ def distance(surfaces: Surfaces, index: np.ndarray, points: np.ndarray) -> np.nd
         points: Positions [mm], shape (N, 3).
 
     Returns:
-        Distances [mm], shape (N,). For a cone it is the distance to the flank, continued past the apex.
+        Distances [mm], shape (N,). For a cone it is the distance to the flank, continued past the
+        apex.
     """
     kind, data = surfaces.kind[index], surfaces.data[index]
     height, radius, _ = _meridian(data, points)
@@ -143,7 +144,7 @@ def distance(surfaces: Surfaces, index: np.ndarray, points: np.ndarray) -> np.nd
 
 
 def gradient(surfaces: Surfaces, index: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the unit gradient of `distance` at every point: the normal to the outside, shape (N, 3)."""
+    """Return the unit gradient of `distance` at every point: the outward normal, shape (N, 3)."""
     kind, data = surfaces.kind[index], surfaces.data[index]
     height, radius, outward = _meridian(data, points)
     a = data[:, 6]
@@ -170,7 +171,8 @@ def _meridian(data: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndar
 def frames(surfaces: Surfaces) -> tuple[np.ndarray, np.ndarray]:
     """Return two unit vectors that are perpendicular to each axis and each other, shapes (S, 3)."""
     axis = surfaces.data[:, 3:6]
-    # Start from the coordinate axis that is most perpendicular, so that aligned surfaces stay aligned.
+    # Start from the coordinate axis that is most perpendicular, so that aligned surfaces stay
+    # aligned.
     helper = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
     first = helper - np.einsum("ij,ij->i", helper, axis)[:, None] * axis
     first /= np.linalg.norm(first, axis=1, keepdims=True)

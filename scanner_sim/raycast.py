@@ -33,8 +33,8 @@ class Hits(NamedTuple):
     surface: np.ndarray
     """Number of the surface, shape (N,), i32; -1 without a hit."""
     side: np.ndarray
-    """1 where the solid is inside of the surface (the outward normal is the gradient), -1 where it is
-    outside, 0 without a hit, shape (N,), i32."""
+    """1 where the solid is inside of the surface (the outward normal is the gradient), -1 where it
+    is outside, 0 without a hit, shape (N,), i32."""
 
 
 def cast(

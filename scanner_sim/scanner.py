@@ -1,8 +1,8 @@
 """The stripe scanner: a laser plane, a camera beside it, and the directions of its passes.
 
-In the frame of a view the stage moves along x, the laser line lies along y, and z points to the probe.
-The laser fans out from a point ``stand_off`` above the plane z = 0; the camera sits beside it in
-the direction of x and looks at the line under the triangulation angle.
+In the frame of a view the stage moves along x, the laser line lies along y, and z points to the
+probe. The laser fans out from a point ``stand_off`` above the plane z = 0; the camera sits beside
+it in the direction of x and looks at the line under the triangulation angle.
 """
 
 from __future__ import annotations

@@ -50,9 +50,9 @@ def simulate(
 ) -> tuple[Scans, Truth]:
     """Scan a part, and say what is true about every point.
 
-    A point exists where the laser's ray first meets the part, if the camera sees that place too (both
-    shadows), at an angle that both bear. The same arguments give the same arrays, on any number
-    of threads.
+    A point exists where the laser's ray first meets the part, if the camera sees that place too
+    (both shadows), at an angle that both bear. The same arguments give the same arrays, on any
+    number of threads.
 
     Args:
         part: The solid, in mm.
@@ -64,8 +64,8 @@ def simulate(
         Scans in the frames of their views (``frame="view"``), and the truth in world coordinates.
 
     Raises:
-        DataError: The part is unbounded, the scanner sees nothing of it, or it cannot deliver as many
-            points as asked for at the pitches that were given.
+        DataError: The part is unbounded, the scanner sees nothing of it, or it cannot deliver as
+            many points as asked for at the pitches that were given.
     """
     scanner = scanner or StripeScanner()
     report = progress or (lambda name, done: None)
@@ -152,7 +152,8 @@ def _extent(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return lowest and highest stage and ray position that meet the part's box, shape (3,) each.
 
-    x = stage, y = where the ray meets the plane z = 0, z = height; all in the frame of the view [mm].
+    x = stage, y = where the ray meets the plane z = 0, z = height; all in the frame of the view
+    [mm].
     """
     middle = limits.mean(axis=0)
     corners = np.array([[limits[i, 0], limits[j, 1], limits[k, 2]]
@@ -160,8 +161,8 @@ def _extent(
     local = (corners - middle) @ view.rotation()
     if local[:, 2].max() >= scanner.stand_off:
         raise DataError(
-            f"the part reaches the probe: its box ends {local[:, 2].max():.0f} mm above its middle, "
-            f"the laser stands at {scanner.stand_off:.0f} mm",
+            f"the part reaches the probe: its box ends {local[:, 2].max():.0f} mm above its "
+            f"middle, the laser stands at {scanner.stand_off:.0f} mm",
             hint="raise stand_off",
         )
     local[:, 1] *= scanner.stand_off / (scanner.stand_off - local[:, 2])
@@ -180,15 +181,13 @@ def _scan(
     across: float,
     along: float,
 ) -> _Pass:
-    """Return every point that laser and camera both see, in scan order, without noise and losses."""
+    """Return all points that laser and camera both see, in scan order, without noise and losses."""
     rotation = view.rotation()
     middle = limits.mean(axis=0)
     low, high = _extent(limits, scanner, view)
-    stripes = int((high[0] - low[0]) / across) + 1
-    columns = int((high[1] - low[1]) / along) + 1
-    # Half a gap at both ends: no ray runs exactly along a side of the part.
-    x = low[0] + (high[0] - low[0] - (stripes - 1) * across) / 2 + across * np.arange(stripes)
-    y = low[1] + (high[1] - low[1] - (columns - 1) * along) / 2 + along * np.arange(columns)
+    x = _spread(low[0], high[0], across)
+    y = _spread(low[1], high[1], along)
+    stripes, columns = len(x), len(y)
     source = np.stack([x, np.zeros(stripes), np.full(stripes, scanner.stand_off)], axis=1)
     ray = np.stack([np.zeros(columns), y, np.full(columns, -scanner.stand_off)], axis=1)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -222,6 +221,12 @@ def _scan(
         source=source_world, position=position[chosen], normal=normal[chosen],
         surface=surface[chosen], sight=sight[chosen],
     )  # fmt: skip
+
+
+def _spread(low: float, high: float, pitch: float) -> np.ndarray:
+    """Return places at a pitch, amid a range: no ray then runs along a side of the part."""
+    count = max(int((high - low) / pitch), 1)
+    return 0.5 * (low + high) + pitch * (np.arange(count) - 0.5 * (count - 1))
 
 
 def _losses(scan: _Pass, scanner: StripeScanner, generator: np.random.Generator) -> np.ndarray:

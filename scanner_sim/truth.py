@@ -1,8 +1,8 @@
-"""What is true about simulated points: their patches, surfaces, and distances to the part's edges."""
+"""What is true about simulated points: patches, surfaces, distances to the part's edges."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -39,12 +39,12 @@ def build_truth(
         surface: Surface of every point, shape (N,), i32.
         stripe: Stripe of every point, shape (N,), i32.
         column: Number of the laser's ray of every point, shape (N,), i32.
-        reach: Pieces of a face that come this close to each other [mm] are one piece, if the face goes
-            on between them.
+        reach: Pieces of a face that come this close to each other [mm] are one piece, if the face
+            goes on between them.
         info: How the points came about.
     """
-    patch = find_patches(part, position, surface, stripe, column, reach)
     edge_distance, edge_class = nearest_edge(trace_edges(part), position)
+    patch = find_patches(part, position, surface, stripe, column, edge_distance, reach)
     on_fillet = part.surfaces.fillet[surface]
     edge_distance[on_fillet] = 0.0
     edge_class[on_fillet] = EdgeClass.FILLET
@@ -66,12 +66,13 @@ def find_patches(
     surface: np.ndarray,
     stripe: np.ndarray,
     column: np.ndarray,
+    edge_distance: np.ndarray,
     reach: float,
 ) -> np.ndarray:
     """Return the patch of every point: connected visible pieces of faces, by size; -1 on fillets.
 
-    Neighbours in the mesh of a view are connected when they lie on one face. So are pieces that come
-    within ``reach`` of each other, in one view (a lost point) or in two, unless the face ends
+    Neighbours in the mesh of a view are connected when they lie on one face, and so are pieces that
+    come within ``reach`` of each other, in one view (a lost point) or in two; unless the face ends
     between them. Fewer than 30 points are no patch.
 
     Args:
@@ -80,16 +81,19 @@ def find_patches(
         surface: Surface of every point, shape (N,), i32.
         stripe: Stripe of every point, unique over all views, shape (N,), i32.
         column: Number of the laser's ray of every point, shape (N,), i32.
+        edge_distance: Distance of every point to the nearest edge [mm], shape (N,).
         reach: Distance that connects pieces [mm].
 
     Returns:
         Patch of every point, 0..K-1, shape (N,), i32; -1 = none.
     """
+    faces = _Faces(part, position, surface, edge_distance)
     pairs = _mesh_pairs(stripe, column)
-    same = surface[pairs[:, 0]] == surface[pairs[:, 1]]
-    step = np.linalg.norm(position[pairs[:, 0]] - position[pairs[:, 1]], axis=1)
-    piece = _components(pairs[same & (step <= reach)], len(position))
-    piece = _components(_bridges(part, position, surface, piece, reach), piece.max() + 1)[piece]
+    pairs = pairs[surface[pairs[:, 0]] == surface[pairs[:, 1]]]
+    pairs = pairs[(faces.length(pairs) <= reach)]
+    pairs = pairs[faces.connect(pairs)]
+    piece = _components(pairs, len(position))
+    piece = _components(_bridges(faces, piece, reach), piece.max() + 1)[piece]
     size = np.bincount(piece)
     size[piece[part.surfaces.fillet[surface]]] = 0
     rank = np.full(len(size), NONE, np.int32)
@@ -121,58 +125,67 @@ def _components(pairs: np.ndarray, count: int) -> np.ndarray:
     return labels
 
 
-def _bridges(
-    part: FlatPart, points: np.ndarray, surface: np.ndarray, piece: np.ndarray, reach: float
-) -> np.ndarray:
+class _Faces(NamedTuple):
+    """Points on the faces of a part, and what is known about them."""
+
+    part: FlatPart
+    position: np.ndarray
+    surface: np.ndarray
+    edge_distance: np.ndarray
+
+    def length(self, pairs: np.ndarray) -> np.ndarray:
+        """Return the distance between the points of every pair [mm], shape (P,)."""
+        step: np.ndarray = self.position[pairs[:, 0]] - self.position[pairs[:, 1]]
+        return np.sqrt(np.einsum("ij,ij->i", step, step))
+
+    def connect(self, pairs: np.ndarray) -> np.ndarray:
+        """Return whether the face goes on between two of its points, shape (P,), bool."""
+        whole = np.ones(len(pairs), bool)
+        room = self.edge_distance[pairs].sum(axis=1)
+        # Where the edges are too far to come between the points, there is nothing to test.
+        doubtful = np.flatnonzero(room <= 1.1 * self.length(pairs) + 0.02)
+        first, second = self.position[pairs[doubtful]].transpose(1, 0, 2)
+        surface = self.surface[pairs[doubtful, 0]]
+        for share in _BETWEEN:
+            middle = (1.0 - share) * first + share * second
+            for _ in range(2):
+                step = distance(self.part.surfaces, surface, middle)
+                middle -= step[:, None] * gradient(self.part.surfaces, surface, middle)
+            whole[doubtful] &= classify(self.part, middle, surface) != 0
+        return whole
+
+
+def _bridges(faces: _Faces, piece: np.ndarray, reach: float) -> np.ndarray:
     """Return pairs of pieces that belong together, shape (B, 2)."""
     from scipy.spatial import cKDTree
 
-    # Faces in one piece need no bridge, nor do fillets. Of the others, one point for each small cell
-    # of each piece is enough to find out which pieces are close.
+    part, points, surface = faces.part, faces.position, faces.surface
+    # Faces in one piece need no bridge, nor do fillets. Of the others, one point for each small
+    # cell of each piece is enough to find out which pieces are close.
     face = np.empty(piece.max() + 1, np.int32)
     face[piece] = surface
     pieces = np.bincount(face, minlength=len(part.surfaces.kind))
     open_ = np.flatnonzero((pieces[surface] > 1) & ~part.surfaces.fillet[surface])
-    cell = np.floor((points[open_] - points.min(axis=0)) / (reach / 4)).astype(np.int64)
+    cell = np.floor((points[open_] - points.min(axis=0)) / (reach / 3)).astype(np.int64)
     extent = cell.max(axis=0, initial=0) + 1
     key = np.ravel_multi_index(tuple(cell.T), tuple(extent)) + extent.prod() * piece[open_]
     kept = open_[np.unique(key, return_index=True)[1]]
     if len(kept) == 0:
         return np.empty((0, 2), np.int64)
     pairs = kept[cKDTree(points[kept]).query_pairs(reach, output_type="ndarray")]
-    first, second = pairs[:, 0], pairs[:, 1]
-    near = (piece[first] != piece[second]) & (surface[first] == surface[second])
-    first, second = first[near], second[near]
-    swap = piece[first] > piece[second]
-    first, second = np.where(swap, second, first), np.where(swap, first, second)
-    couple = piece[first].astype(np.int64) * (piece.max() + 1) + piece[second]
-    length = np.linalg.norm(points[first] - points[second], axis=1)
-    order = np.lexsort((length, couple))
-    first, second, couple = first[order], second[order], couple[order]
+    ends, on = piece[pairs], surface[pairs]
+    pairs = pairs[(ends[:, 0] != ends[:, 1]) & (on[:, 0] == on[:, 1])]
+    couple = np.sort(piece[pairs], axis=1).astype(np.int64) @ [piece.max() + 1, 1]
+    order = np.lexsort((faces.length(pairs), couple))
+    pairs, couple = pairs[order], couple[order]
     # The shortest links of a couple are tried first; where one holds, the others need no test.
     rank = np.arange(len(couple)) - np.searchsorted(couple, couple)
-    tried, bridges = 0, []
+    tried, bridges = _LINKS, [np.empty((0, 2), np.int64)]
     while len(couple):
-        batch = rank < tried + _LINKS
-        holds = _face_between(
-            part, points[first[batch]], points[second[batch]], surface[first[batch]]
-        )
-        bridges.append(np.column_stack([piece[first[batch]], piece[second[batch]]])[holds])
+        batch = rank < tried
+        holds = faces.connect(pairs[batch])
+        bridges.append(piece[pairs[batch][holds]])
         left = ~batch & ~np.isin(couple, couple[batch][holds])
-        first, second, couple, rank = first[left], second[left], couple[left], rank[left]
-        tried = (tried + _LINKS) * 4
-    return np.concatenate([np.empty((0, 2), np.int64), *bridges])
-
-
-def _face_between(
-    part: FlatPart, first: np.ndarray, second: np.ndarray, surface: np.ndarray
-) -> np.ndarray:
-    """Return whether the face goes on between two of its points, shape (P,), bool."""
-    whole = np.ones(len(first), bool)
-    for share in _BETWEEN:
-        middle = (1.0 - share) * first + share * second
-        for _ in range(2):
-            step = distance(part.surfaces, surface, middle)
-            middle -= step[:, None] * gradient(part.surfaces, surface, middle)
-        whole &= classify(part, middle, surface) != 0
-    return whole
+        pairs, couple, rank = pairs[left], couple[left], rank[left]
+        tried *= 4
+    return np.concatenate(bridges)

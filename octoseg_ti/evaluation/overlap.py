@@ -40,6 +40,8 @@ class Overlap:
     """Points of every patch, labelled or not, shape (P,), i64."""
     region_size: np.ndarray
     """Points of every region whose truth is known, shape (R,), i64."""
+    outside: np.ndarray
+    """Regions with more than half of their points where the truth is unknown, shape (R,), bool."""
     row: np.ndarray
     """Patch of every filled place of the table, as an index into ``patch``, shape (M,)."""
     column: np.ndarray
@@ -72,6 +74,10 @@ def overlap_table(truth: np.ndarray, labels: np.ndarray) -> Overlap:
     region, column = compact(label[on])
     patch_size = np.bincount(row, minlength=len(patch))
     region_size = np.bincount(column, minlength=len(region))
+    unknown = labels[~known & (labels >= 0)]
+    place = np.minimum(np.searchsorted(region, unknown), max(len(region) - 1, 0))
+    met = region[place] == unknown if len(region) else np.zeros(len(unknown), bool)
+    beyond = np.bincount(place[met], minlength=len(region))
     width = max(len(region), 1)
     key = row[on].astype(np.int64) * width + column
     if len(patch) * width <= 4 * len(key) + 1_000_000:
@@ -85,6 +91,7 @@ def overlap_table(truth: np.ndarray, labels: np.ndarray) -> Overlap:
         region=region,
         patch_size=patch_size,
         region_size=region_size,
+        outside=beyond > region_size,
         row=place // width,
         column=place % width,
         count=count,
@@ -141,7 +148,9 @@ def hoover(table: Overlap, threshold: float) -> HooverCounts:
             patch_free[patches] = False
             region_free[regions] = False
             counts[name] += 1
-    return HooverCounts(**counts, missed=int(patch_free.sum()), noise=int(region_free.sum()))
+    # A region that lies mostly where nobody knows the truth cannot be called wrong.
+    noise = int((region_free & ~table.outside).sum())
+    return HooverCounts(**counts, missed=int(patch_free.sum()), noise=noise)
 
 
 def _groups(places: np.ndarray, owner: np.ndarray) -> list[np.ndarray]:

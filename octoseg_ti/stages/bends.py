@@ -3,8 +3,8 @@
 A bend that is wider than the smallest cell leaves a chain of agreeing cells, through which the flood
 passes from face to face. The paper's remedy is to remove the smallest cells by hand until the faces
 come apart (section 3.4). Here the turning of the normals from cell to cell tells where a region
-bends; it is tried with several limits of that turning, and a cut is accepted when the turning is
-concentrated in what was removed: every face is flat compared with the angle to its nearest sister. A
+bends: the cells that turn most are removed, and the cut is accepted when the turning is concentrated
+in what was removed: every face is flat compared with the angle to its nearest sister. A
 surface of even curvature never passes: removing any half of it leaves pieces that turn by t with
 gaps of t between them; such a piece has the deviation t / sqrt(12), and its sister stands at the
 angle 2 t: a ratio of 0.14.
@@ -20,8 +20,6 @@ from octoseg_ti.stages.moments import HI, LEVEL, LO, NORMAL, POINT, X, Y, Z
 from octoseg_ti.stages.regions import flood_fill
 from octoseg_ti.types import NONE
 
-# Turning over one smallest cell [rad] above which a cell counts as bent, coarse to fine.
-_TURNS = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035)
 _ONE = 1048576.0  # 2^20
 # Well below the 0.14 of an evenly curved surface.
 _FLAT = 0.08
@@ -29,11 +27,17 @@ _FLAT = 0.08
 _COVERAGE = 0.6
 # ... and so much of what the faces hold must be flat; the rest may be cut further.
 _FLAT_SHARE = 0.4
+# A cell belongs to a face when its normal is within this share of the angle to the next face.
+_RIM = 0.25
+# ... and the rims of two faces are half that angle apart: this share keeps them from joining.
+_APART = 0.4
+# A cut that leaves one piece with more than this share is none.
+_WHOLE = 0.95
 # Faces at a smaller angle are not told apart [rad].
 _LEAST_ANGLE = 0.1
 
 
-def _faces_are_flat(
+def _flat_faces(
     piece: np.ndarray,
     count: np.ndarray,
     normal: np.ndarray,
@@ -41,8 +45,8 @@ def _faces_are_flat(
     noise: float,
     least_angle: float,
     signed: bool,
-) -> bool:
-    """Say whether the pieces are flat faces that stand at an angle to each other.
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the flat faces among the pieces of a region, if the region consists of such.
 
     Args:
         piece: Piece of every cell of the region, 0..K-1, -1 = removed, shape (c,).
@@ -51,11 +55,15 @@ def _faces_are_flat(
         noise: Deviation of the normals that is noise [rad].
         least_angle: Pieces at a smaller angle are parallel; they say nothing about bends [rad].
         signed: Normals have a side.
+
+    Returns:
+        Normals of the flat faces, shape (F, 3), and the angle of each to its nearest sister, shape
+        (F,); None when the turning is not concentrated in what was removed.
     """
     pieces = int(piece.max(initial=NONE)) + 1
     inside = piece >= 0
     if pieces < 2 or count[inside].sum() < _COVERAGE * count.sum():
-        return False
+        return None
     tensor = np.zeros((pieces, 3, 3))
     size = np.bincount(piece[inside], weights=count[inside], minlength=pieces)
     n = normal[inside]
@@ -76,7 +84,9 @@ def _faces_are_flat(
     nearest = np.arccos(np.clip(cosine.max(axis=1), -1.0, 1.0))
     nearest[(cosine == -1.0).all(axis=1)] = 0.0
     flat = np.sqrt(spread) <= _FLAT * nearest
-    return flat.sum() >= 2 and bool(size[flat].sum() >= _FLAT_SHARE * size.sum())
+    if flat.sum() < 2 or size[flat].sum() < _FLAT_SHARE * size.sum():
+        return None
+    return axis[flat], nearest[flat]
 
 
 @ti.kernel
@@ -116,9 +126,13 @@ def _sum_turns(
                     count = 1.0 / (node_in[c, HI] - node_in[c, LO])
                     count += 1.0 / (node_in[b, HI] - node_in[b, LO])
                     # What the noise of the mean normals adds is taken off, also where that leaves
-                    # less than nothing: the sum over the pairs is right.
-                    turn = ti.cast(ti.round(((n - m).norm_sqr() - variance * count) * _ONE), ti.i64)
-                    far = ti.cast(ti.round(d.norm_sqr() / (finest * finest) * _ONE), ti.i64)
+                    # less than nothing: the sum over the pairs is right. Every pair has one vote
+                    # on the curvature, or large cells would drown the bend beside them.
+                    square = d.norm_sqr() / (finest * finest)
+                    weight = 1.0 / ti.max(1.0, square)
+                    change = weight * ((n - m).norm_sqr() - variance * count)
+                    turn = ti.cast(ti.round(change * _ONE), ti.i64)
+                    far = ti.cast(ti.round(weight * square * _ONE), ti.i64)
                     ti.atomic_add(sum_inout[c, 0], turn)
                     ti.atomic_add(sum_inout[c, 1], far)
                     ti.atomic_add(sum_inout[b, 0], turn)
@@ -188,41 +202,67 @@ def split_at_bends(
     if not suspects:
         return result
     turn = turning(grid, group, noise)
-    tried: dict[int, int] = {}
-    for limit in _TURNS:
+    while suspects:
         straight = {}
         for name, cells in suspects.items():
+            limit = _valley(turn[cells], count[cells])
             kept = turn[cells] <= limit
-            points = count[cells[kept]].sum()
-            if not kept.all() and points >= _COVERAGE * count[cells].sum():
-                if tried.get(name) != points:
-                    straight[name] = cells[kept]
-                tried[name] = points
+            if not kept.all() and count[cells[kept]].sum() >= _COVERAGE * count[cells].sum():
+                straight[name] = cells[kept]
         if not straight:
-            continue
+            break
         takes_part = np.zeros(grid.count, bool)
         takes_part[np.concatenate(list(straight.values()))] = True
         pieces = flood_fill(grid, takes_part, homogeneity=homogeneity, chord=chord, slack=slack)
         inside = np.flatnonzero(pieces >= 0)
         points = np.bincount(pieces[inside], weights=count[inside], minlength=grid.count)
         pieces[inside] = np.where(points[pieces[inside]] >= min_points, pieces[inside], NONE)
+        cut = {}
+        narrow = homogeneity
         for name in straight:
             cells = suspects[name]
             names, numbered = np.unique(pieces[cells], return_inverse=True)
-            if _faces_are_flat(
+            normal = mean[cells, NORMAL : NORMAL + 3]
+            faces = _flat_faces(
                 numbered - int(names[0] == NONE),
                 count[cells],
-                mean[cells, NORMAL : NORMAL + 3],
+                normal,
                 noise=noise,
                 least_angle=max(_LEAST_ANGLE, 2.0 * flat),
                 signed=grid.signed,
-            ):
-                result[cells] = pieces[cells]
-                del suspects[name]
-                normals = mean[cells, NORMAL : NORMAL + 3]
-                again = _suspects(pieces[cells], count[cells], normals, 2 * min_points, flat)
-                suspects.update({piece: cells[part] for piece, part in again.items()})
+            )
+            if faces is not None:
+                # What turns by chance alone, and the rim of a bend, go back to the faces.
+                cosine = np.abs(normal @ faces[0].T)
+                near = (cosine >= np.cos(_RIM * faces[1])).any(axis=1)
+                takes_part[cells] = (pieces[cells] >= 0) | near
+                cut[name] = cells
+                narrow = min(narrow, _APART * float(faces[1].min()))
+            else:
+                takes_part[cells] = False
+        if not cut:
+            break
+        pieces = flood_fill(grid, takes_part, homogeneity=narrow, chord=chord, slack=slack)
+        suspects = {}
+        for cells in cut.values():
+            sizes = np.bincount(pieces[cells] + 1, weights=count[cells])[1:]
+            if sizes.max() > _WHOLE * count[cells].sum():
+                continue  # the rims closed the gaps again: it is one face
+            result[cells] = pieces[cells]
+            normal = mean[cells, NORMAL : NORMAL + 3]
+            again = _suspects(pieces[cells], count[cells], normal, 2 * min_points, flat)
+            suspects.update({name: cells[part] for name, part in again.items()})
     return result
+
+
+def _valley(turn: np.ndarray, count: np.ndarray) -> float:
+    """Return the limit that parts the turning best into little and much (Otsu's criterion)."""
+    order = np.argsort(turn, kind="stable")
+    weight = np.cumsum(count[order], dtype=np.float64)
+    sums = np.cumsum(count[order] * turn[order])
+    low, high = weight[:-1], weight[-1] - weight[:-1]
+    apart = (sums[:-1] / low - (sums[-1] - sums[:-1]) / high) ** 2 * low * high
+    return float(turn[order[int(np.argmax(apart))]]) if len(apart) else float("inf")
 
 
 def _suspects(

@@ -14,7 +14,6 @@ from octoseg_ti.device.morton import AXIS_BITS, compacted, morton_keys
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, I64Array, ti
 from octoseg_ti.errors import DataError
 from octoseg_ti.stages.moments import (
-    EDGE,
     HI,
     LEVEL,
     LO,
@@ -57,7 +56,7 @@ class Grid:
     root: Any
     """Node of every initial cell, -1 if empty, shape (product of ``shape``,), i32."""
     node: Any
-    """Integers of every node: lo, hi, level, x, y, z, stop reason, edge; shape (M, 8), i32."""
+    """Integers of every node: lo, hi, level, x, y, z, stop reason; shape (M, 7), i32."""
     child: Any
     """Daughters of every node, -1 if empty; first entry -2 for a leaf; shape (M, 8), i32."""
     mean: Any
@@ -172,8 +171,7 @@ def _decide(
     last: ti.i32,
     min_points: ti.i32,
     halt: ti.i32,
-    tolerance: ti.f64,
-    residual: ti.f64,
+    limit: ti.types.vector(3, ti.f64),
     shift: ti.i32,
     # In:
     key_in: I64Array,
@@ -185,19 +183,23 @@ def _decide(
 ):
     """Decide which nodes of a level are split, and where their daughters begin.
 
-    ``halt`` is the stop reason of this level, or 0 when its cells may be split.
+    ``halt`` is the stop reason of this level, or 0 when its cells may be split. The limits are of
+    the deviation, of the residual, and of the deviation of a cell that cannot be split.
     """
     for c in range(first, last):
         lo = node_inout[c, LO]
         hi = node_inout[c, HI]
         stop = 0
         count = 0
-        rough = mean_in[c, SIGMA] > tolerance or mean_in[c, RESIDUAL] > residual
-        if rough:
+        sigma = mean_in[c, SIGMA]
+        step = mean_in[c, RESIDUAL] > limit[1]
+        if sigma > limit[0] or step:
             stop = halt
             if hi - lo < min_points:
                 stop = _FEW_POINTS
-            if stop == 0:
+            if stop != 0 and sigma <= limit[2] and not step:
+                stop = 0
+            elif stop == 0:
                 bound_out[c - first, 0] = lo
                 for o in range(8):
                     a = bound_out[c - first, o]
@@ -212,7 +214,6 @@ def _decide(
                     count += ti.cast(a > bound_out[c - first, o], ti.i32)
         count_out[c - first] = count
         node_inout[c, STOP] = stop
-        node_inout[c, EDGE] = ti.cast(rough and count == 0, ti.i32)
 
 
 @ti.kernel
@@ -293,6 +294,7 @@ def build_grid(
     normals: np.ndarray,
     *,
     tolerance: float,
+    edge_tolerance: float | None = None,
     divisions: int | None = None,
     min_cell: float = 0.0,
     min_points: int = 2,
@@ -306,6 +308,8 @@ def build_grid(
         points: Positions [mm], world, shape (n, 3), f64, finite.
         normals: Unit normals, shape (n, 3), f64; a zero row counts as none.
         tolerance: Largest deviation of the normals in a cell (Eq. 4).
+        edge_tolerance: Largest deviation of a cell that cannot be split and still counts as
+            homogeneous; None = the tolerance (the paper).
         divisions: Cells along the shortest side of the box (section 3.3); None makes the initial
             cell a power of two times ``min_cell``.
         min_cell: Smallest cell [mm]; 0 = as small as a key can address.
@@ -340,13 +344,14 @@ def build_grid(
         runtime.upload(corner), order, point, runtime.upload(normals), sorted_point, sorted_normal
     )
 
+    roughness = tolerance if edge_tolerance is None else max(tolerance, edge_tolerance)
     workers, stride = runtime.workers()
     heads = runtime.empty(workers, np.int32)
     _count_heads(n, workers, stride, 3 * depth, key, heads)
     counts = runtime.download(heads)
     count = int(counts.sum())
     place = (np.cumsum(counts) - counts).astype(np.int32)
-    node = runtime.empty((2 * count, 8), np.int32)
+    node = runtime.empty((2 * count, 7), np.int32)
     root = runtime.upload(np.full(shape[0] * shape[1] * shape[2], -1, np.int32))
     _emit_heads(
         n, workers, stride, 3 * depth, ti.Vector(shape), key, runtime.upload(place), node, root
@@ -367,8 +372,8 @@ def build_grid(
         bound = runtime.empty((count - first, 9), np.int32)
         residual = flatness * tolerance * cell + 3.0 * noise
         _decide(
-            first, count, min_points, halt, tolerance, residual, 3 * (depth - level - 1),
-            key, mean, node, daughters, bound,
+            first, count, min_points, halt, ti.Vector([tolerance, residual, roughness]),
+            3 * (depth - level - 1), key, mean, node, daughters, bound,
         )  # fmt: skip
         counts = runtime.download(daughters)
         place = (count + np.cumsum(counts) - counts).astype(np.int32)

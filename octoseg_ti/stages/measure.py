@@ -10,7 +10,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F32Array, F64Rows, I32Array, ti
 
-_SAMPLES = 100_000
+_SAMPLES = 25_000
 # Mean of the lower three quarters of |x| for x normal, and of a Rayleigh variable, both of unit scale.
 # Trimmed means instead of medians: coarse quantisation can make a median zero.
 _TRIM = 0.75

@@ -18,7 +18,7 @@ _ONE = 1073741824.0  # 2^30: a sum of 2^33 values still fits 64 bits
 _SLICE = 256
 
 # Columns of the integer table of the cells ...
-LO, HI, LEVEL, X, Y, Z, STOP, EDGE = range(8)
+LO, HI, LEVEL, X, Y, Z, STOP = range(7)
 # ... and of the real one: normalised mean normal (3), mean point (3), deviation, residual.
 NORMAL, POINT, SIGMA, RESIDUAL = 0, 3, 6, 7
 

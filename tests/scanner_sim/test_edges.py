@@ -10,7 +10,17 @@ import numpy as np
 from octoseg_ti.types import EdgeClass
 from scanner_sim.edges import Edges, nearest_edge, trace_edges
 from scanner_sim.part import (
-    Part, box, cone, cylinder, difference, half_space, intersection, outside, rod, sphere, torus,
+    Part,
+    box,
+    cone,
+    cylinder,
+    difference,
+    half_space,
+    intersection,
+    outside,
+    rod,
+    sphere,
+    torus,
     union,
 )  # fmt: skip
 
@@ -67,7 +77,8 @@ def test_a_machined_block() -> None:
             cone((0, 5, 12), (0, 0, -1), math.atan(0.25)), box((-4, 1, 4), (4, 9, 10))
         ),
     )  # fmt: skip
-    expected = _box_lines(low, high) + [
+    expected = [
+        *_box_lines(low, high),
         _circle((5, 0, 6), 3.0), _circle((5, 0, 3), 3.0), _circle((-5, 0, 6), 3.0),
         _circle((0, 5, 6), 1.5), _circle((0, 5, 10), 0.5),
     ]  # fmt: skip
@@ -90,7 +101,7 @@ def test_oblique_parts_have_oblique_edges() -> None:
 
 
 def _rounded_block() -> Part:
-    """A block with one rounded edge, along y at x = 5, z = 4, and a round key with a rounded rim."""
+    """A block with a rounded edge, along y at x = 5, z = 4, and a key with a rounded rim."""
     cut = intersection(
         half_space((4, 0, 0), (-1, 0, 0)), half_space((0, 0, 3), (0, 0, -1)),
         outside(cylinder((4, 0, 3), (0, 1, 0), 1.0, fillet=True)),
@@ -103,7 +114,11 @@ def _rounded_block() -> Part:
 
 def test_fillets_have_smooth_borders() -> None:
     edges = trace_edges(_rounded_block().flat())
-    fillet = [_line((5, -4, 3), (5, 4, 3)), _line((4, -4, 4), (4, 4, 4)), _circle((-1, 0, 4.5), 1.5)]
+    fillet = [
+        _line((5, -4, 3), (5, 4, 3)),
+        _line((4, -4, 4), (4, 4, 4)),
+        _circle((-1, 0, 4.5), 1.5),
+    ]
     _assert_same(edges, fillet, EdgeClass.FILLET)
     ends = [p[(p[:, 0] >= 4) & (p[:, 2] >= 3)]
             for p in (_circle((4, y, 3), 1.0, axis=1) for y in (-4, 4))]  # fmt: skip

@@ -12,7 +12,17 @@ from hypothesis import strategies as st
 
 from octoseg_ti.errors import DataError
 from scanner_sim.part import (
-    Part, box, cone, cylinder, difference, half_space, intersection, outside, rod, sphere, torus,
+    Part,
+    box,
+    cone,
+    cylinder,
+    difference,
+    half_space,
+    intersection,
+    outside,
+    rod,
+    sphere,
+    torus,
     union,
 )  # fmt: skip
 from scanner_sim.quadric import canonical

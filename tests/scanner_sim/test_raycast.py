@@ -10,7 +10,17 @@ from brute_force import first_hit, leaves, solid
 
 from octoseg_ti.types import SurfaceKind
 from scanner_sim.part import (
-    Part, box, cone, cylinder, difference, half_space, intersection, outside, rod, sphere, torus,
+    Part,
+    box,
+    cone,
+    cylinder,
+    difference,
+    half_space,
+    intersection,
+    outside,
+    rod,
+    sphere,
+    torus,
     union,
 )  # fmt: skip
 from scanner_sim.quadric import distance, gradient
