@@ -116,9 +116,10 @@ def _mark_borders(
                 z = node_in[c, Z] + o % 3 - 1
                 b = find_node(x, y, z, level, shape, depth, root_in, child_in)
                 if b >= 0 and group_in[b] >= 0 and group_in[b] != group_in[c]:
-                    if size_in[group_in[b]] > size_in[group_in[c]]:
+                    mine, other = size_in[group_in[c]], size_in[group_in[b]]
+                    if other > mine:
                         border_inout[c] = 1
-                    else:
+                    elif other < mine:
                         border_inout[b] = 1
 
 
