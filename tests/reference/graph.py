@@ -146,7 +146,10 @@ def turning(
     noise: float,
     finest: float,
 ) -> tuple[dict[int, float], dict[int, int]]:
-    """Return the root mean square turning over one smallest cell, and the number of neighbours."""
+    """Return the root mean square turning over one smallest cell, and the number of neighbours.
+
+    Pairs that are farther apart than a smallest cell count less, by the square of their distance.
+    """
     turn = dict.fromkeys((c.node for c in leaves), 0.0)
     far = dict.fromkeys(turn, 0.0)
     neighbours = dict.fromkeys(turn, 0)
@@ -156,9 +159,10 @@ def turning(
         m = b.normal if a.normal @ b.normal >= 0 else -b.normal
         t = float((a.normal - m) @ (a.normal - m)) - noise**2 * (1 / a.count + 1 / b.count)
         d = float((a.point - b.point) @ (a.point - b.point)) / finest**2
+        weight = 1.0 / max(1.0, d)
         for c in (a, b):
-            turn[c.node] += t
-            far[c.node] += d
+            turn[c.node] += weight * t
+            far[c.node] += weight * d
             neighbours[c.node] += 1
     return (
         {n: math.sqrt(max(0.0, turn[n]) / far[n]) if far[n] > 0 else 0.0 for n in turn},

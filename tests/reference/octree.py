@@ -111,6 +111,7 @@ def build_tree(
     normals: np.ndarray,
     *,
     tolerance: float,
+    edge_tolerance: float | None = None,
     divisions: int | None = None,
     min_cell: float = 0.0,
     min_points: int = 2,
@@ -122,6 +123,7 @@ def build_tree(
     corner = points.min(axis=0)
     size, shape, depth = layout(points.max(axis=0) - corner, divisions, min_cell)
     finest = size / 2.0**depth
+    roughness = max(tolerance, edge_tolerance or 0.0)
     most = np.array(shape) * 2**depth - 1
     box = np.clip(np.floor((points - corner) / finest), 0, most).astype(np.int64)
     cells: dict[tuple[int, int, int, int], Cell] = {}
@@ -137,17 +139,22 @@ def build_tree(
         cells[cell.key] = cell
         edge = size / 2.0**level
         most_residual = flatness * tolerance * edge + 3 * noise
-        closest = min(closest, abs(sigma - tolerance))
+        closest = min(closest, abs(sigma - tolerance), abs(sigma - roughness))
         if math.isfinite(flatness):
             closest = min(closest, abs(residual - most_residual) / size)
         if sigma <= tolerance and not residual > most_residual:
             cell.stop = StopReason.HOMOGENEOUS
-        elif len(members) < min_points:
+            return cell
+        if len(members) < min_points:
             cell.stop = StopReason.FEW_POINTS
         elif edge / 2 < min_cell * (1 - 1e-9):
             cell.stop = StopReason.MIN_SIZE
         elif level == depth:
             cell.stop = StopReason.MAX_LEVEL
+        if cell.stop is not None:
+            # A cell that cannot be split may be somewhat rougher and still pass.
+            if sigma <= roughness and not residual > most_residual:
+                cell.stop = StopReason.HOMOGENEOUS
         else:
             below = depth - level - 1
             for daughter in sorted({tuple(b) for b in (box[members] >> below).tolist()}):
