@@ -114,6 +114,14 @@ def _sum_turns(
                 z = node_in[c, Z] + o % 3 - 1
                 b = find_node(x, y, z, level, shape, depth, root_in, child_in)
                 if b >= 0 and b < c and group_in[b] == group_in[c]:
+                    # A larger cell covers several of the places around; the first one counts.
+                    up = level - node_in[b, LEVEL]
+                    if (
+                        x != ti.max(node_in[c, X] - 1, node_in[b, X] << up)
+                        or y != ti.max(node_in[c, Y] - 1, node_in[b, Y] << up)
+                        or z != ti.max(node_in[c, Z] - 1, node_in[b, Z] << up)
+                    ):
+                        continue
                     n = row(mean_in, c)
                     m = row(mean_in, b)
                     if n.dot(m) < 0.0:
