@@ -39,13 +39,10 @@ def edges_by_radius(size: list[float], tolerance: float, radius: float) -> list[
     ]
 
 
-def leaf_at(q: np.ndarray, leaves: list[Leaf], size: float) -> Leaf | None:
+def leaf_at(q: np.ndarray, leaves: list[Leaf], low: np.ndarray, high: np.ndarray) -> Leaf | None:
     """Return the leaf whose half-open box holds a place, relative to the corner of the grid."""
-    for c in leaves:
-        edge = size / 2.0**c.level
-        if np.all(q >= c.place * edge) and np.all(q < (c.place + 1) * edge):
-            return c
-    return None
+    holds = np.flatnonzero(np.all((q >= low) & (q < high), axis=1))
+    return leaves[int(holds[0])] if len(holds) else None
 
 
 def candidates(
@@ -61,9 +58,11 @@ def candidates(
     angle: float,
 ) -> list[tuple[float, float, int]]:
     """Return (distance from the plane, distance from the mean point, label) of the cells that fit."""
+    low = np.array([size / 2.0**c.level * c.place for c in leaves])
+    high = np.array([size / 2.0**c.level * (c.place + 1) for c in leaves])
     found = []
     for step in itertools.product((-1, 0, 1), repeat=3):
-        c = leaf_at(p + distance * np.array(step), leaves, size)
+        c = leaf_at(p + distance * np.array(step), leaves, low, high)
         if c is None or label.get(c.node, -1) < 0:
             continue
         off = abs(float((p - c.point) @ c.normal))
