@@ -328,8 +328,9 @@ def build_grid(
     """
     runtime.ensure_started()
     n = len(points)
-    corner = points.min(axis=0)
-    extent = points.max(axis=0) - corner
+    # Column by column: a reduction over rows of three is slow.
+    corner = np.array([points[:, k].min() for k in range(3)])
+    extent = np.array([points[:, k].max() for k in range(3)]) - corner
     if not extent.max() > 0.0:
         raise DataError("all points coincide")
     size, shape, depth = _lay_out(extent, divisions, min_cell)
