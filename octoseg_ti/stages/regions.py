@@ -101,9 +101,10 @@ def _mark_borders(
             for k in range(count_in[c]):
                 b = neighbor_in[c, k]
                 if group_in[b] >= 0 and group_in[b] != group_in[c]:
-                    if size_in[group_in[b]] > size_in[group_in[c]]:
+                    mine, other = size_in[group_in[c]], size_in[group_in[b]]
+                    if other > mine:
                         border_inout[c] = 1
-                    else:
+                    elif other < mine:
                         border_inout[b] = 1
 
 
