@@ -278,7 +278,7 @@ def grow_regions(
     if doubtful.any():
         claimed = claimed_share(grid, leaves, label, np.where(doubtful, number, NONE))
         dropped = np.append(claimed > _CLAIMED, True)
-        group[doubtful & dropped[number]] = NONE
+        group[dropped[np.where(doubtful, number, NONE)] & doubtful] = NONE
         bends = np.flatnonzero(bend & (group >= 0))
         cells = np.full(grid.count, NONE, np.int32)
         cells[bends] = np.arange(len(bends), dtype=np.int32)
