@@ -174,8 +174,9 @@ def _button(x: float, sign: float) -> Part:
     """
     wall, radius, height, z = 21.25, 4.5, 1.25, 6.25
     ball = (radius**2 + height**2) / (2.0 * height)
-    deep, outer = sign * (wall - 1.0), sign * (wall + height)
-    limits = box((x - ball, min(deep, outer), z - ball), (x + ball, max(deep, outer), z + ball))
+    root, deep, outer = height + 1.0, sign * (wall - 1.0), sign * (wall + height)
+    reach = math.sqrt(ball**2 - (ball - root) ** 2)
+    limits = box((x - reach, min(deep, outer), z - reach), (x + reach, max(deep, outer), z + reach))
     return intersection(sphere((x, outer - sign * ball, z), ball), limits)
 
 
