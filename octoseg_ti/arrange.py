@@ -26,6 +26,8 @@ class Arranged:
     """Index of the stripe of every point, shape (n,), i32; None for unorganised points."""
     start: np.ndarray | None
     """First point of every stripe, and n at the end, shape (S + 1,), i32."""
+    whole: bool
+    """Every row of the input is there, in its order."""
 
 
 def as_scans(
@@ -110,11 +112,11 @@ def arrange(scans: Scans, drop: np.ndarray | None = None) -> Arranged:
     Raises:
         DataError: Fewer than three usable points, or a single stripe.
     """
-    usable = np.isfinite(scans.points).all(axis=1)
-    if scans.normals is not None:
-        usable &= np.isfinite(scans.normals).all(axis=1)
-    if drop is not None:
-        usable &= ~drop
+    usable = np.ones(len(scans.points), bool) if drop is None else ~drop
+    for rows in (scans.points, scans.normals):
+        finite = None if rows is None else np.isfinite(rows)
+        if finite is not None and not finite.all():
+            usable &= finite.all(axis=1)
     row = np.arange(len(usable)) if usable.all() else np.flatnonzero(usable)
     if len(row) < 3:
         raise DataError(
@@ -162,4 +164,5 @@ def _arranged(
         view=np.ascontiguousarray(view, np.int32),
         run=run,
         start=start,
+        whole=whole,
     )

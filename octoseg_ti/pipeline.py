@@ -12,7 +12,13 @@ from octoseg_ti.defaults import derive, spacing_of
 from octoseg_ti.device import runtime
 from octoseg_ti.device.profiling import Trace
 from octoseg_ti.params import PRESETS, Params
-from octoseg_ti.stages.assignment import assign_points, points_of_leaves, claimed_share
+from octoseg_ti.stages.adjacency import find_touching
+from octoseg_ti.stages.assignment import (
+    assign_points,
+    claimed_share,
+    points_of_leaves,
+    to_rows,
+)
 from octoseg_ti.stages.bends import split_at_bends
 from octoseg_ti.stages.cleaning import mark_outliers
 from octoseg_ti.stages.edges import edges_by_level, edges_by_radius, edges_by_reason
@@ -246,7 +252,8 @@ def grow_regions(
     }
     takes_part = np.zeros(grid.count, bool)
     takes_part[leaves[edge == int(EdgeClass.NONE)]] = True
-    group = flood_fill(grid, takes_part, **rule)
+    touching = find_touching(grid)
+    group = flood_fill(grid, touching, takes_part, **rule)
     min_points = params.regions.min_points
     if literal or not params.regions.assign_edges:
         cell_label = number_groups(grid, group, min_points)
@@ -254,6 +261,7 @@ def grow_regions(
     whole = group
     group = split_at_bends(
         grid,
+        touching,
         whole,
         min_points=min_points,
         flat=params.grid.edge_tolerance,
@@ -263,29 +271,30 @@ def grow_regions(
     bend = (group < 0) & (whole >= 0)
     finest = grid.size / 2.0**grid.depth
     fit = {
-        "reach": finest,
         "limit": _JOIN_CELLS * finest + 3.0 * measured.noise,
         "tight": _LIE_CELLS * finest + 3.0 * measured.noise,
         "angle": _BEND_TOLERANCES * params.grid.edge_tolerance,
     }
     # Groups that larger ones explain are no patches: strips along an edge, and bends that are as
     # flat as the face beside them. What is left of them stands for itself.
-    group[bend] = flood_fill(grid, bend, **rule)[bend]
+    group[bend] = flood_fill(grid, touching, bend, **rule)[bend]
     number = number_groups(grid, group, min_points)
-    doubtful = (strips(grid, group) | bend) & (number >= 0)
+    doubtful = (strips(grid, touching, group) | bend) & (number >= 0)
     cell_label = np.where(doubtful, NONE, number)
-    label = assign_points(grid, leaves, cell_label, bend=bend, **fit)
     if doubtful.any():
-        claimed = claimed_share(grid, leaves, label, np.where(doubtful, number, NONE))
-        dropped = np.append(claimed > _CLAIMED, True)
-        group[dropped[np.where(doubtful, number, NONE)] & doubtful] = NONE
+        judged = assign_points(
+            grid, leaves, cell_label, bend=bend, only=doubtful | bend, rounds=1, **fit
+        )
+        asked = np.flatnonzero(doubtful)
+        claimed = claimed_share(grid, leaves, judged, np.where(doubtful, number, NONE))
+        group[asked[claimed[number[asked]] > _CLAIMED]] = NONE
         bends = np.flatnonzero(bend & (group >= 0))
         cells = np.full(grid.count, NONE, np.int32)
         cells[bends] = np.arange(len(bends), dtype=np.int32)
-        flush = bends[claimed_share(grid, leaves, label, cells) > _CLAIMED]
+        flush = bends[claimed_share(grid, leaves, judged, cells) > _CLAIMED]
         group[flush] = NONE
         cell_label = number_groups(grid, group, min_points)
-        label = assign_points(grid, leaves, cell_label, bend=bend, **fit)
+    label = assign_points(grid, leaves, cell_label, bend=bend, **fit)
     return cell_label, label
 
 
@@ -314,17 +323,20 @@ def assemble(
     flat = 2.0 * measured.noise + 0.02 * spacing_of(measured)
     kind, parameters, residual = fit_planes(grid, core, patches, limit=flat)
 
-    row = arranged.row[runtime.download(grid.order)]
     n = len(scans)
-    labels, outlier = np.full(n, NONE, np.int32), np.ones(n, np.uint8)
-    edges, levels = np.zeros(n, np.uint8), np.full(n, -1, np.int8)
-    labels[row], outlier[row] = label, 0
-    edges[row] = points_of_leaves(grid, leaves, edge)
-    levels[row] = points_of_leaves(grid, leaves, node[leaves, LEVEL].astype(np.int8))
-    normals, points = np.zeros((n, 3), np.float32), np.full((n, 3), np.nan)
-    normals[arranged.row], points[arranged.row] = normal, point
-    left_out = np.flatnonzero(outlier)
-    if len(left_out):
+    labels, levels, edges = to_rows(
+        grid, leaves, edge, label, None if arranged.whole else arranged.row, n
+    )
+    outlier = np.zeros(n, np.uint8)
+    if not arranged.whole:
+        outlier[:] = 1
+        outlier[arranged.row] = 0
+    if arranged.whole:
+        normals, points = normal.astype(np.float32), point
+    else:
+        normals, points = np.zeros((n, 3), np.float32), np.full((n, 3), np.nan)
+        normals[arranged.row], points[arranged.row] = normal, point
+        left_out = np.flatnonzero(outlier)
         points[left_out] = scans_in_world(scans, left_out)
     mean = runtime.download(grid.mean)[leaves]
     cells = Cells(

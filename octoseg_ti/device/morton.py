@@ -49,7 +49,7 @@ def _code(
     for i in key_out:
         key = ti.i64(0)
         for k in ti.static(range(3)):
-            at = ti.cast(ti.floor((point_in[i, k] - corner_in[k]) * scale), ti.i32)
+            at = ti.cast((point_in[i, k] - corner_in[k]) * scale, ti.i32)
             at = ti.max(0, ti.min(last_in[k], at))
             key = key | (_spread(ti.cast(at, ti.i64)) << (2 - k))
         key_out[i] = key

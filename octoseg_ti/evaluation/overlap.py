@@ -127,7 +127,9 @@ def hoover(table: Overlap, threshold: float) -> HooverCounts:
     for m in np.flatnonzero((of_patch >= threshold) & (of_region >= threshold)):
         score = float(of_patch[m] + of_region[m]) / 2
         found.append((score, "correct", row[m : m + 1], column[m : m + 1]))
-    for places in _groups(np.flatnonzero(of_region >= threshold), row):
+    # The sliver by which a region on unknown truth enters a patch does not split that patch.
+    part = (of_region >= threshold) & ~table.outside[column]
+    for places in _groups(np.flatnonzero(part), row):
         k, parts = row[places[0]], column[places]
         shared = count[places].sum()
         if shared / table.patch_size[k] >= threshold:

@@ -10,7 +10,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.stages.grid import Grid, find_node
-from octoseg_ti.stages.moments import HI, LO, POINT
+from octoseg_ti.stages.moments import HI, LEVEL, LO, POINT
 from octoseg_ti.types import NONE
 
 _ROUNDS = 3
@@ -18,7 +18,8 @@ _ROUNDS = 3
 
 @ti.kernel
 def _join(
-    rule: ti.types.vector(4, ti.f64),
+    reach: ti.i32,
+    rule: ti.types.vector(3, ti.f64),
     finest: ti.f64,
     depth: ti.i32,
     shape: ti.types.vector(3, ti.i32),
@@ -28,42 +29,144 @@ def _join(
     root_in: I32Array,
     mean_in: F64Rows,
     cell_label_in: I32Array,
-    todo_in: I32Rows,
+    run_in: I32Rows,
     # Out:
-    label_inout: I32Array,
+    best_inout: F64Rows,
 ):
-    """Give points without a label that of the nearest mean plane among the cells at a distance.
+    """Find, for runs of points in one box, the nearest mean plane among the cells at a distance.
 
-    The rule holds the reach, the largest distance from the plane, that distance on a bend where the
-    normals differ, and the cosine from which they do not.
+    The rule holds the largest distance from the plane, that distance on a bend where the normals
+    differ, and the cosine from which they do not. Ties go to the nearer cell, then to the smaller
+    label, never to the order of the points.
     """
-    for t in range(todo_in.shape[0]):
-        i = todo_in[t, 0]
-        bend = todo_in[t, 1]
-        p = row(point_in, i)
-        best = rule[1]
-        chosen = -1
-        nearest = 0.0
+    for u in range(run_in.shape[0]):
+        lo = run_in[u, 0]
+        hi = run_in[u, 1]
+        bend = run_in[u, 2]
+        x = ti.cast(point_in[lo, 0] * finest, ti.i32)
+        y = ti.cast(point_in[lo, 1] * finest, ti.i32)
+        z = ti.cast(point_in[lo, 2] * finest, ti.i32)
+        before = -1
         for o in range(27):
-            q = p + rule[0] * vec3(o // 9 - 1, (o // 3) % 3 - 1, o % 3 - 1)
-            x = ti.cast(ti.floor(q[0] * finest), ti.i32)
-            y = ti.cast(ti.floor(q[1] * finest), ti.i32)
-            z = ti.cast(ti.floor(q[2] * finest), ti.i32)
-            c = find_node(x, y, z, depth, shape, depth, root_in, child_in)
-            if c >= 0 and cell_label_in[c] >= 0:
-                d = p - vec3(mean_in[c, POINT], mean_in[c, POINT + 1], mean_in[c, POINT + 2])
-                off = ti.abs(d.dot(row(mean_in, c)))
-                far = d.norm()
-                if bend >= 0 and off > rule[2]:
-                    if ti.abs(row(mean_in, bend).dot(row(mean_in, c))) < rule[3]:
-                        off = rule[1]
-                # Ties go to the nearer cell, then to the smaller label: never to the order.
-                if off < best or (off == best and chosen >= 0 and far < nearest):
-                    best = off
-                    chosen = cell_label_in[c]
-                    nearest = far
-        if chosen >= 0:
-            label_inout[i] = chosen
+            c = find_node(
+                x + reach * (o // 9 - 1),
+                y + reach * ((o // 3) % 3 - 1),
+                z + reach * (o % 3 - 1),
+                depth,
+                shape,
+                depth,
+                root_in,
+                child_in,
+            )
+            if c >= 0 and c != before and cell_label_in[c] >= 0:
+                label = ti.cast(cell_label_in[c], ti.f64)
+                normal = row(mean_in, c)
+                middle = vec3(mean_in[c, POINT], mean_in[c, POINT + 1], mean_in[c, POINT + 2])
+                limit = rule[0]
+                if bend >= 0 and ti.abs(row(mean_in, bend).dot(normal)) < rule[2]:
+                    limit = rule[1]
+                for i in range(lo, hi):
+                    k = run_in[u, 3] + i - lo
+                    d = row(point_in, i) - middle
+                    off = ti.abs(d.dot(normal))
+                    far = d.norm_sqr()
+                    if off <= limit and (
+                        off < best_inout[k, 0]
+                        or (off == best_inout[k, 0] and far < best_inout[k, 1])
+                        or (
+                            off == best_inout[k, 0]
+                            and far == best_inout[k, 1]
+                            and label < best_inout[k, 2]
+                        )
+                    ):
+                        best_inout[k, 0] = off
+                        best_inout[k, 1] = far
+                        best_inout[k, 2] = label
+            before = c
+
+
+def _runs(grid: Grid, index: np.ndarray, bend: np.ndarray | None) -> np.ndarray:
+    """Return the runs of points that lie in one smallest box.
+
+    Args:
+        grid: The sparse grid.
+        index: Sorted points in question, ascending, shape (q,).
+        bend: Node of the bend that each of them is on, -1 = none, shape (q,); None = none at all.
+
+    Returns:
+        First point, end, bend, and place of the first point in ``index``, shape (r, 4), i32.
+    """
+    box = (runtime.download(grid.point)[index] * (2.0**grid.depth / grid.size)).astype(np.int32)
+    new = np.ones(len(index), bool)
+    new[1:] = (np.diff(index) > 1) | (box[1:] != box[:-1]).any(axis=1)
+    first = np.flatnonzero(new)
+    last = np.append(first[1:], len(index)) - 1
+    runs = np.empty((len(first), 4), np.int32)
+    runs[:, 0], runs[:, 1], runs[:, 3] = index[first], index[last] + 1, first
+    runs[:, 2] = NONE if bend is None else bend[first]
+    return runs
+
+
+@ti.kernel
+def _scatter(
+    # In:
+    row_in: I32Array,
+    label_in: I32Array,
+    leaf_in: I32Array,
+    level_in: I32Array,
+    edge_in: I32Array,
+    # Out:
+    label_out: I32Array,
+    level_out: I32Array,
+    edge_out: I32Array,
+):
+    """Write label, level and edge class of the sorted points to their rows."""
+    for i in row_in:
+        r = row_in[i]
+        label_out[r] = label_in[i]
+        level_out[r] = level_in[leaf_in[i]]
+        edge_out[r] = edge_in[leaf_in[i]]
+
+
+def to_rows(
+    grid: Grid,
+    leaves: np.ndarray,
+    edge: np.ndarray,
+    label: np.ndarray,
+    row: np.ndarray | None,
+    rows: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bring labels, levels and edge classes of the sorted points into the order of the input.
+
+    Args:
+        grid: The sparse grid.
+        leaves: The nodes that are leaves, in Morton order, shape (C,).
+        edge: `EdgeClass` of every leaf, shape (C,).
+        label: Label of every sorted point, shape (n,), i32.
+        row: Input row of every point of the grid, shape (n,), i64; None = the points as they are.
+        rows: Number of input rows; those of no point get label -1, level -1 and no edge.
+
+    Returns:
+        Labels, shape (rows,), i32; levels, shape (rows,), i8; edge classes, shape (rows,), u8.
+    """
+    runtime.ensure_started()
+    node = runtime.download(grid.node)
+    level = node[leaves, LEVEL]
+    leaf = points_of_leaves(grid, leaves, np.arange(len(leaves), dtype=np.int32))
+    at = grid.order
+    if row is not None:
+        at = runtime.upload(row[runtime.download(grid.order)].astype(np.int32))
+    out = [runtime.upload(np.full(rows, value, np.int32)) for value in (NONE, -1, 0)]
+    _scatter(
+        at,
+        runtime.upload(label),
+        runtime.upload(leaf),
+        runtime.upload(level),
+        runtime.upload(edge.astype(np.int32)),
+        *out,
+    )
+    labels, levels, edges = (runtime.download(a) for a in out)
+    return labels, levels.astype(np.int8), edges.astype(np.uint8)
 
 
 def points_of_leaves(grid: Grid, leaves: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -87,10 +190,11 @@ def assign_points(
     cell_label: np.ndarray,
     *,
     bend: np.ndarray,
-    reach: float,
     limit: float,
     tight: float,
     angle: float,
+    only: np.ndarray | None = None,
+    rounds: int = _ROUNDS,
 ) -> np.ndarray:
     """Give the points without a label to the patch whose surface they lie on.
 
@@ -100,9 +204,10 @@ def assign_points(
         cell_label: Label of every node, -1 for edge cells and for those of no patch, shape (M,), i32.
         bend: Nodes on a bend, shape (M,), bool. Their points join a patch when they lie on its plane,
             or when they are near it and its normal agrees with that of their cell.
-        reach: How far to look in the first round [mm], about the smallest cell.
         limit: Largest distance of a point from the mean plane of the cell whose patch it joins [mm].
         tight: Largest distance from the plane on a bend where the normals do not agree [mm].
+        only: Nodes whose points are looked at, shape (M,), bool; None = all.
+        rounds: How many smallest cells away to look at most.
         angle: Largest angle between the normals of a bend and of the cell whose patch it joins [rad].
 
     Returns:
@@ -112,15 +217,22 @@ def assign_points(
     label = np.ascontiguousarray(points_of_leaves(grid, leaves, cell_label[leaves]), np.int32)
     if not np.any(cell_label >= 0):
         return label
-    bend_of = points_of_leaves(grid, leaves, np.where(bend[leaves], leaves, NONE).astype(np.int32))
+    asked = label < 0
+    if only is not None:
+        asked &= points_of_leaves(grid, leaves, only[leaves])
+    index = np.flatnonzero(asked)
+    on_bend = None
+    if bend.any():
+        named = np.where(bend[leaves], leaves, NONE).astype(np.int32)
+        on_bend = points_of_leaves(grid, leaves, named)[index]
     device_cell = runtime.upload(cell_label.astype(np.int32))
-    for r in range(1, _ROUNDS + 1):
-        todo = np.flatnonzero(label < 0).astype(np.int32)
-        if len(todo) == 0:
+    for r in range(1, rounds + 1):
+        if len(index) == 0:
             break
-        device_label = runtime.upload(label)
+        best = runtime.upload(np.full((len(index), 3), np.inf))
         _join(
-            ti.Vector([r * reach, limit, tight, float(np.cos(angle))]),
+            r,
+            ti.Vector([limit, tight, float(np.cos(angle))]),
             2.0**grid.depth / grid.size,
             grid.depth,
             ti.Vector(grid.shape),
@@ -129,10 +241,14 @@ def assign_points(
             grid.root,
             grid.mean,
             device_cell,
-            runtime.upload(np.stack([todo, bend_of[todo]], axis=1)),
-            device_label,
+            runtime.upload(_runs(grid, index, on_bend)),
+            best,
         )
-        label = runtime.download(device_label)
+        name = runtime.download(best)[:, 2]
+        found = np.isfinite(name)
+        label[index[found]] = name[found].astype(np.int32)
+        index = index[~found]
+        on_bend = None if on_bend is None else on_bend[~found]
     return label
 
 

@@ -15,8 +15,9 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, I64Rows, ti
-from octoseg_ti.stages.grid import Grid, find_node
-from octoseg_ti.stages.moments import HI, LEVEL, LO, NORMAL, POINT, X, Y, Z
+from octoseg_ti.stages.adjacency import Adjacency
+from octoseg_ti.stages.grid import Grid
+from octoseg_ti.stages.moments import HI, LO, NORMAL, POINT
 from octoseg_ti.stages.regions import flood_fill
 from octoseg_ti.types import NONE
 
@@ -91,14 +92,12 @@ def _flat_faces(
 
 @ti.kernel
 def _sum_turns(
-    depth: ti.i32,
     variance: ti.f64,
     finest: ti.f64,
-    shape: ti.types.vector(3, ti.i32),
     # In:
     node_in: I32Rows,
-    child_in: I32Rows,
-    root_in: I32Array,
+    count_in: I32Array,
+    neighbor_in: I32Rows,
     mean_in: F64Rows,
     group_in: I32Array,
     # Out:
@@ -107,14 +106,12 @@ def _sum_turns(
     """Add up, for every cell, squared turning and squared distance to the touching cells of its group."""
     for c in group_in:
         if group_in[c] >= 0:
-            level = node_in[c, LEVEL]
-            for o in range(27):
-                x = node_in[c, X] + o // 9 - 1
-                y = node_in[c, Y] + (o // 3) % 3 - 1
-                z = node_in[c, Z] + o % 3 - 1
-                b = find_node(x, y, z, level, shape, depth, root_in, child_in)
-                if b >= 0 and b < c and group_in[b] == group_in[c]:
-                    n = row(mean_in, c)
+            n = row(mean_in, c)
+            own_turn = ti.i64(0)
+            own_far = ti.i64(0)
+            for k in range(count_in[c]):
+                b = neighbor_in[c, k]
+                if group_in[b] == group_in[c]:
                     m = row(mean_in, b)
                     if n.dot(m) < 0.0:
                         m = -m
@@ -131,19 +128,24 @@ def _sum_turns(
                     square = d.norm_sqr() / (finest * finest)
                     weight = 1.0 / ti.max(1.0, square)
                     change = weight * ((n - m).norm_sqr() - variance * count)
-                    turn = ti.cast(ti.round(change * _ONE), ti.i64)
-                    far = ti.cast(ti.round(weight * square * _ONE), ti.i64)
-                    ti.atomic_add(sum_inout[c, 0], turn)
-                    ti.atomic_add(sum_inout[c, 1], far)
+                    turn = ti.cast(change * _ONE, ti.i64)
+                    far = ti.cast(weight * square * _ONE, ti.i64)
+                    own_turn += turn
+                    own_far += far
                     ti.atomic_add(sum_inout[b, 0], turn)
                     ti.atomic_add(sum_inout[b, 1], far)
+            ti.atomic_add(sum_inout[c, 0], own_turn)
+            ti.atomic_add(sum_inout[c, 1], own_far)
 
 
-def turning(grid: Grid, group: np.ndarray, noise: float) -> np.ndarray:
+def turning(
+    grid: Grid, touching: Adjacency, group: np.ndarray, noise: float
+) -> np.ndarray:
     """Return how far the normal turns over one smallest cell, around every cell of a group.
 
     Args:
         grid: The sparse grid.
+        touching: Its touching pairs of leaves.
         group: Group of every node, -1 = none, shape (M,), i32.
         noise: Deviation of the normals that is noise [rad].
 
@@ -153,13 +155,11 @@ def turning(grid: Grid, group: np.ndarray, noise: float) -> np.ndarray:
     runtime.ensure_started()
     sums = runtime.zeros((grid.count, 2), np.int64)
     _sum_turns(
-        grid.depth,
         noise**2,
         grid.size / 2.0**grid.depth,
-        ti.Vector(grid.shape),
         grid.node,
-        grid.child,
-        grid.root,
+        touching.count,
+        touching.neighbor,
         grid.mean,
         runtime.upload(group),
         sums,
@@ -170,6 +170,7 @@ def turning(grid: Grid, group: np.ndarray, noise: float) -> np.ndarray:
 
 def split_at_bends(
     grid: Grid,
+    touching: Adjacency,
     group: np.ndarray,
     *,
     homogeneity: float,
@@ -183,6 +184,7 @@ def split_at_bends(
 
     Args:
         grid: The sparse grid.
+        touching: Its touching pairs of leaves.
         group: Group of every node, named by its first node, -1 = none, shape (M,), i32.
         homogeneity: As for `flood_fill` [rad].
         chord: As for `flood_fill`.
@@ -201,19 +203,27 @@ def split_at_bends(
     suspects = _suspects(group, count, mean[:, NORMAL : NORMAL + 3], 2 * min_points, flat)
     if not suspects:
         return result
-    turn = turning(grid, group, noise)
+    named = np.full(grid.count, NONE, np.int32)
+    for name, cells in suspects.items():
+        named[cells] = name
+    turn = turning(grid, touching, named, noise)
+    # The highest valley may only part the worst cells from the rest: then the next one below it.
+    bound = dict.fromkeys(suspects, np.inf)
     while suspects:
         straight = {}
         for name, cells in suspects.items():
-            limit = _valley(turn[cells], count[cells])
-            kept = turn[cells] <= limit
+            below = turn[cells] <= bound[name]
+            bound[name] = _valley(turn[cells[below]], count[cells[below]])
+            kept = turn[cells] <= bound[name]
             if not kept.all() and count[cells[kept]].sum() >= _COVERAGE * count[cells].sum():
                 straight[name] = cells[kept]
         if not straight:
             break
         takes_part = np.zeros(grid.count, bool)
         takes_part[np.concatenate(list(straight.values()))] = True
-        pieces = flood_fill(grid, takes_part, homogeneity=homogeneity, chord=chord, slack=slack)
+        pieces = flood_fill(
+            grid, touching, takes_part, homogeneity=homogeneity, chord=chord, slack=slack
+        )
         inside = np.flatnonzero(pieces >= 0)
         points = np.bincount(pieces[inside], weights=count[inside], minlength=grid.count)
         pieces[inside] = np.where(points[pieces[inside]] >= min_points, pieces[inside], NONE)
@@ -240,18 +250,24 @@ def split_at_bends(
                 narrow = min(narrow, _APART * float(faces[1].min()))
             else:
                 takes_part[cells] = False
+        suspects = {name: suspects[name] for name in straight if name not in cut}
         if not cut:
-            break
-        pieces = flood_fill(grid, takes_part, homogeneity=narrow, chord=chord, slack=slack)
-        suspects = {}
-        for cells in cut.values():
+            continue
+        pieces = flood_fill(
+            grid, touching, takes_part, homogeneity=narrow, chord=chord, slack=slack
+        )
+        for name, cells in cut.items():
             sizes = np.bincount(pieces[cells] + 1, weights=count[cells])[1:]
             if sizes.max() > _WHOLE * count[cells].sum():
-                continue  # the rims closed the gaps again: it is one face
+                suspects[name] = cells  # the rims closed the gaps again
+                continue
             result[cells] = pieces[cells]
             normal = mean[cells, NORMAL : NORMAL + 3]
-            again = _suspects(pieces[cells], count[cells], normal, 2 * min_points, flat)
-            suspects.update({name: cells[part] for name, part in again.items()})
+            for piece, part in _suspects(
+                pieces[cells], count[cells], normal, 2 * min_points, flat
+            ).items():
+                suspects[piece] = cells[part]
+                bound[piece] = np.inf
     return result
 
 
@@ -270,15 +286,17 @@ def _suspects(
 ) -> dict[int, np.ndarray]:
     """Return the cells of every group that is large and not flat, by the name of the group."""
     inside = np.flatnonzero(group >= 0)
-    order = inside[np.argsort(group[inside], kind="stable")]
-    names, first = np.unique(group[order], return_index=True)
-    found = {}
-    for name, cells in zip(names, np.split(order, first[1:]), strict=True):
-        size = count[cells].sum()
-        # Axes, not directions: without sides a mean of directions means nothing.
-        weighted = normal[cells] * count[cells, None]
-        if size >= min_points:
-            largest = np.linalg.eigvalsh(weighted.T @ normal[cells])[-1] / size
-            if 1.0 - largest > flat**2:
-                found[int(name)] = cells
-    return found
+    names, owner = np.unique(group[inside], return_inverse=True)
+    weight, n = count[inside], normal[inside]
+    size = np.bincount(owner, weights=weight, minlength=len(names))
+    # Axes, not directions: without sides a mean of directions means nothing.
+    tensor = np.empty((len(names), 3, 3))
+    for a, b in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+        sums = np.bincount(owner, weights=weight * n[:, a] * n[:, b], minlength=len(names))
+        tensor[:, a, b] = tensor[:, b, a] = sums / size
+    doubtful = (size >= min_points) & (1.0 - np.linalg.eigvalsh(tensor)[:, 2] > flat**2)
+    order = np.argsort(owner, kind="stable")
+    first = np.searchsorted(owner[order], np.arange(len(names) + 1))
+    return {
+        int(names[g]): inside[order[first[g] : first[g + 1]]] for g in np.flatnonzero(doubtful)
+    }

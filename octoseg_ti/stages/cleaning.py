@@ -12,11 +12,11 @@ from octoseg_ti.device.runtime import F64Rows, I32Array, ti
 
 
 @ti.func
-def _to_segment(p: vec3, a: vec3, b: vec3) -> ti.f64:
-    """Return the distance of a point from a segment."""
+def _square_to_segment(p: vec3, a: vec3, b: vec3) -> ti.f64:
+    """Return the squared distance of a point from a segment."""
     ab = b - a
     t = ti.max(0.0, ti.min(1.0, (p - a).dot(ab) / ti.max(ab.norm_sqr(), 1e-300)))
-    return (p - (a + t * ab)).norm()
+    return (p - (a + t * ab)).norm_sqr()
 
 
 @ti.kernel
@@ -35,24 +35,23 @@ def _mark(
         lo = start_in[run_in[i]]
         hi = start_in[run_in[i] + 1]
         p = row(point_in, i)
-        marked = 0
+        a = row(point_in, ti.max(i - 1, lo))
+        b = row(point_in, ti.min(i + 1, hi - 1))
         nearest = 1e300
         if i > lo:
-            nearest = (row(point_in, i - 1) - p).norm()
+            nearest = (a - p).norm_sqr()
         if i + 1 < hi:
-            nearest = ti.min(nearest, (row(point_in, i + 1) - p).norm())
-        if nearest > isolation:
-            marked = 1
+            nearest = ti.min(nearest, (b - p).norm_sqr())
+        marked = ti.cast(nearest > isolation * isolation, ti.i32)
         # Two neighbours on either side must lie close together, as if the point were not there:
         # both sides of a step pass this test with one side missing, so a step marks nothing.
-        if i - 2 >= lo and i + 2 < hi and marked == 0:
-            a = row(point_in, i - 1)
-            b = row(point_in, i + 1)
+        off = spike * spike
+        if nearest > off and marked == 0 and i - 2 >= lo and i + 2 < hi:
             if (
-                (a - b).norm() < isolation
-                and _to_segment(p, a, b) > spike
-                and _to_segment(p, row(point_in, i - 2), a) > spike
-                and _to_segment(p, b, row(point_in, i + 2)) > spike
+                (a - b).norm_sqr() < isolation * isolation
+                and _square_to_segment(p, a, b) > off
+                and _square_to_segment(p, row(point_in, i - 2), a) > off
+                and _square_to_segment(p, b, row(point_in, i + 2)) > off
             ):
                 marked = 1
         outlier_out[i] = marked

@@ -247,6 +247,15 @@ def _emit_children(
                     at += 1
 
 
+def _cells_along(extent: np.ndarray, size: float) -> np.ndarray:
+    """Return how many cells cover each side of the box, at least one.
+
+    Points on the upper side of the box belong to the last cell: a side of exactly twelve cells must
+    not get a thirteenth for them, least of all depending on how the division is rounded.
+    """
+    return np.maximum(np.ceil(extent / size * (1.0 - 1e-12)), 1.0)
+
+
 def _lay_out(
     extent: np.ndarray, divisions: int | None, min_cell: float
 ) -> tuple[float, tuple[int, int, int], int]:
@@ -257,9 +266,9 @@ def _lay_out(
         size = float(thick.min()) / divisions
     else:
         size = min_cell * 2.0**_DEFAULT_LEVELS
-        while np.prod(np.floor(extent / size) + 1.0) > _MOST_ROOTS:
+        while np.prod(_cells_along(extent, size)) > _MOST_ROOTS:
             size *= 2.0
-    cells = np.floor(extent / size) + 1.0
+    cells = _cells_along(extent, size)
     if np.prod(cells) > _MOST_ROOTS:
         raise DataError(
             f"initial cells of {size:.3g} mm would number {np.prod(cells):.3g}",
@@ -319,8 +328,9 @@ def build_grid(
     """
     runtime.ensure_started()
     n = len(points)
-    corner = points.min(axis=0)
-    extent = points.max(axis=0) - corner
+    # Column by column: a reduction over rows of three is slow.
+    corner = np.array([points[:, k].min() for k in range(3)])
+    extent = np.array([points[:, k].max() for k in range(3)]) - corner
     if not extent.max() > 0.0:
         raise DataError("all points coincide")
     size, shape, depth = _lay_out(extent, divisions, min_cell)

@@ -16,6 +16,9 @@ from octoseg_ti.device.runtime import F64Rows, I32Rows, I64Rows, ti
 COUNT = 19
 _ONE = 1073741824.0  # 2^30: a sum of 2^33 values still fits 64 bits
 _SLICE = 256
+# Rows and columns of the upper triangle of a symmetric matrix, in the order of its six sums.
+_ROW = (0, 0, 0, 1, 1, 2)
+_COLUMN = (0, 1, 2, 1, 2, 2)
 
 # Columns of the integer table of the cells ...
 LO, HI, LEVEL, X, Y, Z, STOP = range(7)
@@ -26,7 +29,7 @@ NORMAL, POINT, SIGMA, RESIDUAL = 0, 3, 6, 7
 @ti.func
 def _fixed(x: ti.f64) -> ti.i64:
     """Return a value of -1..1 in fixed point."""
-    return ti.cast(ti.round(x * _ONE), ti.i64)
+    return ti.cast(x * _ONE, ti.i64)
 
 
 @ti.kernel
@@ -34,6 +37,7 @@ def _accumulate(
     first: ti.i32,
     last: ti.i32,
     slices: ti.i32,
+    signed: ti.i32,
     size: ti.f64,
     # In:
     node_in: I32Rows,
@@ -67,9 +71,15 @@ def _accumulate(
                     for k in ti.static(range(3)):
                         sums[1 + k] += _fixed(n[k])
                         sums[10 + k] += _fixed(p[k])
+                    if signed == 1:
+                        # With a side, only the trace of sum N N' is used: how many have a normal.
+                        sums[4] += _fixed(n.norm_sqr())
+                    else:
+                        for k in ti.static(range(6)):
+                            a, b = ti.static(_ROW[k]), ti.static(_COLUMN[k])
+                            sums[4 + k] += _fixed(n[a] * n[b])
                     for k in ti.static(range(6)):
-                        a, b = ti.static((0, 0, 0, 1, 1, 2)[k]), ti.static((0, 1, 2, 1, 2, 2)[k])
-                        sums[4 + k] += _fixed(n[a] * n[b])
+                        a, b = ti.static(_ROW[k]), ti.static(_COLUMN[k])
                         sums[13 + k] += _fixed(p[a] * p[b])
                     i += 1
                 for k in ti.static(range(COUNT)):
@@ -147,5 +157,5 @@ def describe_cells(
     runtime.ensure_started()
     moment = runtime.zeros((last - first, COUNT), np.int64)
     slices = -(-point.shape[0] // _SLICE)
-    _accumulate(first, last, slices, size, node, point, normal, moment)
+    _accumulate(first, last, slices, int(signed), size, node, point, normal, moment)
     _describe(first, last, int(signed), size, node, moment, mean)

@@ -109,14 +109,16 @@ def neighbor_normals(
     spacing = float(np.median(nearest)) if len(nearest) else 0.0
     off = np.sort(runtime.download(height))
     off = off[off >= 0]
-    # The lower three quarters: the others may lie on edges. A plane takes three degrees of freedom.
-    noise = float(np.sqrt(np.mean(off[: max(1, 3 * len(off) // 4)] ** 2, dtype=np.float64)))
-    noise *= float(np.sqrt(count / max(1, count - 3))) if len(off) else 0.0
+    noise = 0.0
+    if len(off):
+        # The lower three quarters: the others may lie on edges. A plane takes three degrees of freedom.
+        kept = off[: max(1, 3 * len(off) // 4)]
+        noise = float(np.sqrt(np.mean(kept**2, dtype=np.float64) * count / max(1, count - 3)))
     # Slope of a plane fitted in a disc of radius r: sigma / (r / 2) / sqrt(count), in two directions.
     tilt = 2.0 * np.sqrt(2.0 / count) * noise / float(np.median(radius))
     return runtime.download(normal), Measurement(
         spacing_along=spacing,
         spacing_across=spacing,
-        noise=noise if len(off) else 0.0,
-        normal_noise=tilt if len(off) else 0.0,
+        noise=noise,
+        normal_noise=tilt,
     )

@@ -26,13 +26,15 @@ def _edge_pair(origin: vec3, first: vec3, second: vec3, gap: ti.f64, by_area: ti
     e1 = first - origin
     e2 = second - origin
     n = vec3(0.0, 0.0, 0.0)
-    if e1.norm() <= gap and e2.norm() <= gap and (first - second).norm() <= gap:
-        n = e1.cross(e2)
-        size = n.norm()
-        if size > 1e-12 * e1.norm() * e2.norm() and by_area == 0:
-            n = n / size
-        elif by_area == 0:
-            n = vec3(0.0, 0.0, 0.0)
+    a = e1.norm_sqr()
+    b = e2.norm_sqr()
+    if ti.max(a, b) <= gap * gap and (first - second).norm_sqr() <= gap * gap:
+        cross = e1.cross(e2)
+        square = cross.norm_sqr()
+        if square > 1e-24 * a * b:
+            n = cross
+            if by_area == 0:
+                n = cross / ti.sqrt(square)
     return n
 
 
@@ -63,11 +65,11 @@ def _march(
             axis = row(axis_in, view_in[b])
             sum_a = vec3(0.0, 0.0, 0.0)
             sum_b = vec3(0.0, 0.0, 0.0)
+            origin = row(point_in, a)
+            first = row(point_in, b)
+            next_a = row(point_in, ti.min(a + 1, a_last))
+            next_b = row(point_in, ti.min(b + 1, b_last))
             while a < a_last or b < b_last:
-                origin = row(point_in, a)
-                first = row(point_in, b)
-                next_b = row(point_in, ti.min(b + 1, b_last))
-                next_a = row(point_in, ti.min(a + 1, a_last))
                 along_first = 0  # 1: case I, the next point of the first stripe
                 if a == a_last:
                     along_first = 1
@@ -76,22 +78,24 @@ def _march(
                         along_first = ti.cast((next_b - next_a).dot(axis) <= 0.0, ti.i32)
                     else:
                         along_first = ti.cast(
-                            (next_b - origin).norm() <= (next_a - first).norm(), ti.i32
+                            (next_b - origin).norm_sqr() <= (next_a - first).norm_sqr(), ti.i32
                         )
-                second = next_a
                 if along_first == 1:
-                    second = next_b
-                n = _edge_pair(origin, first, second, gap, by_area)
-                sum_a += n
-                sum_b += n
-                if along_first == 1:
-                    _add(sum_inout, b, sum_b)
-                    b += 1
+                    n = _edge_pair(origin, first, next_b, gap, by_area)
+                    sum_a += n
+                    _add(sum_inout, b, sum_b + n)
                     sum_b = n
+                    b += 1
+                    first = next_b
+                    next_b = row(point_in, ti.min(b + 1, b_last))
                 else:
-                    _add(sum_inout, a, sum_a)
-                    a += 1
+                    n = _edge_pair(origin, first, next_a, gap, by_area)
+                    sum_b += n
+                    _add(sum_inout, a, sum_a + n)
                     sum_a = n
+                    a += 1
+                    origin = next_a
+                    next_a = row(point_in, ti.min(a + 1, a_last))
             _add(sum_inout, a, sum_a)
             _add(sum_inout, b, sum_b)
 
@@ -218,9 +222,11 @@ def edge_pair_normals(
                 normal,
             )
     if origin is None:
+        # The middle of the view, by the middle points of its stripes.
+        middle = (start[:-1] + start[1:] - 1) // 2
         reference = np.zeros((views, 3))
-        for v in range(views):
-            reference[v] = points[view == v].mean(axis=0) if np.any(view == v) else 0.0
+        np.add.at(reference, view[middle], points[middle])
+        reference /= np.maximum(np.bincount(view[middle], minlength=views), 1)[:, None]
     else:
         reference = np.asarray(origin, np.float64)
     vote = runtime.zeros(views, np.int32)

@@ -35,10 +35,10 @@ def _sum_patches(
                 p = scale * (row(point_in, i) - middle)
                 s[0] += ti.i64(1)
                 for k in ti.static(range(3)):
-                    s[1 + k] += ti.cast(ti.round(p[k] * _ONE), ti.i64)
+                    s[1 + k] += ti.cast(p[k] * _ONE, ti.i64)
                 for k in ti.static(range(6)):
                     a, b = ti.static((0, 0, 0, 1, 1, 2)[k]), ti.static((0, 1, 2, 1, 2, 2)[k])
-                    s[4 + k] += ti.cast(ti.round(p[a] * p[b] * _ONE), ti.i64)
+                    s[4 + k] += ti.cast(p[a] * p[b] * _ONE, ti.i64)
                 i += 1
             if label >= 0:
                 for k in ti.static(range(_SUMS)):

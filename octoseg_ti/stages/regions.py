@@ -10,8 +10,9 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.unionfind import unite
-from octoseg_ti.stages.grid import Grid, find_node
-from octoseg_ti.stages.moments import HI, LEVEL, LO, POINT, X, Y, Z
+from octoseg_ti.stages.adjacency import Adjacency
+from octoseg_ti.stages.grid import Grid
+from octoseg_ti.stages.moments import HI, LEVEL, LO, POINT
 from octoseg_ti.types import NONE
 
 # A face has at least this share of its area in cells that touch no larger face.
@@ -50,28 +51,19 @@ def _flood(
     chord: ti.f64,
     slack: ti.f64,
     signed: ti.i32,
-    depth: ti.i32,
-    shape: ti.types.vector(3, ti.i32),
     # In:
-    node_in: I32Rows,
-    child_in: I32Rows,
-    root_in: I32Array,
+    count_in: I32Array,
+    neighbor_in: I32Rows,
     mean_in: F64Rows,
     # Out:
     parent_inout: I32Array,
 ):
-    """Unite every leaf with the touching leaves of its own size or larger that agree with it."""
+    """Unite every leaf with the touching leaves that agree with it."""
     for c in parent_inout:
         if parent_inout[c] >= 0:
-            level = node_in[c, LEVEL]
-            for o in range(27):
-                x = node_in[c, X] + o // 9 - 1
-                y = node_in[c, Y] + (o // 3) % 3 - 1
-                z = node_in[c, Z] + o % 3 - 1
-                b = find_node(x, y, z, level, shape, depth, root_in, child_in)
-                # Nodes are numbered level by level: a smaller number is a coarser cell, or one of
-                # the same size. So every touching pair is looked at exactly once.
-                if b >= 0 and b < c and child_in[b, 0] == -2 and parent_inout[b] >= 0:
+            for k in range(count_in[c]):
+                b = neighbor_in[c, k]
+                if parent_inout[b] >= 0:
                     if _agree(c, b, signed, mean_in, cosine, chord, slack) == 1:
                         unite(parent_inout, c, b)
 
@@ -95,12 +87,9 @@ def _flatten(
 
 @ti.kernel
 def _mark_borders(
-    depth: ti.i32,
-    shape: ti.types.vector(3, ti.i32),
     # In:
-    node_in: I32Rows,
-    child_in: I32Rows,
-    root_in: I32Array,
+    count_in: I32Array,
+    neighbor_in: I32Rows,
     group_in: I32Array,
     size_in: I32Array,
     # Out:
@@ -109,21 +98,19 @@ def _mark_borders(
     """Mark the leaves that touch a leaf of a larger group."""
     for c in group_in:
         if group_in[c] >= 0:
-            level = node_in[c, LEVEL]
-            for o in range(27):
-                x = node_in[c, X] + o // 9 - 1
-                y = node_in[c, Y] + (o // 3) % 3 - 1
-                z = node_in[c, Z] + o % 3 - 1
-                b = find_node(x, y, z, level, shape, depth, root_in, child_in)
-                if b >= 0 and group_in[b] >= 0 and group_in[b] != group_in[c]:
-                    if size_in[group_in[b]] > size_in[group_in[c]]:
+            for k in range(count_in[c]):
+                b = neighbor_in[c, k]
+                if group_in[b] >= 0 and group_in[b] != group_in[c]:
+                    mine, other = size_in[group_in[c]], size_in[group_in[b]]
+                    if other > mine:
                         border_inout[c] = 1
-                    else:
+                    elif other < mine:
                         border_inout[b] = 1
 
 
 def flood_fill(
     grid: Grid,
+    touching: Adjacency,
     leaf: np.ndarray,
     *,
     homogeneity: float,
@@ -136,6 +123,7 @@ def flood_fill(
 
     Args:
         grid: The sparse grid.
+        touching: Its touching pairs of leaves.
         leaf: Which nodes take part (leaves that are no edge cells), shape (M,), bool.
         homogeneity: Largest angle between the mean normals of merged cells [rad].
         chord: Largest sine of the angle between the line through the mean points of two cells and
@@ -154,11 +142,8 @@ def flood_fill(
         min(chord, 1e300),
         slack,
         int(grid.signed),
-        grid.depth,
-        ti.Vector(grid.shape),
-        grid.node,
-        grid.child,
-        grid.root,
+        touching.count,
+        touching.neighbor,
         grid.mean,
         device_parent,
     )
@@ -167,22 +152,19 @@ def flood_fill(
     return runtime.download(group)
 
 
-def inner_cells(grid: Grid, group: np.ndarray, size: np.ndarray) -> np.ndarray:
+def inner_cells(touching: Adjacency, group: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Return the leaves of groups that touch no leaf of a larger group, shape (M,), bool.
 
     Args:
-        grid: The sparse grid.
+        touching: Touching pairs of leaves.
         group: Group of every node, -1 = none, shape (M,), i32; only leaves have one.
         size: Points of every group, by its name, shape (M,).
     """
     runtime.ensure_started()
-    border = runtime.zeros(grid.count, np.int32)
+    border = runtime.zeros(len(group), np.int32)
     _mark_borders(
-        grid.depth,
-        ti.Vector(grid.shape),
-        grid.node,
-        grid.child,
-        grid.root,
+        touching.count,
+        touching.neighbor,
         runtime.upload(group),
         runtime.upload(size.astype(np.int32)),
         border,
@@ -218,7 +200,7 @@ def group_sizes(grid: Grid, group: np.ndarray) -> np.ndarray:
     return np.bincount(group[inside], weights=count, minlength=grid.count)
 
 
-def strips(grid: Grid, group: np.ndarray) -> np.ndarray:
+def strips(grid: Grid, touching: Adjacency, group: np.ndarray) -> np.ndarray:
     """Return the nodes of groups that may be strips along a larger one, shape (M,), bool.
 
     Along an edge the normals of two faces are averaged; cells that hold only such points agree with
@@ -226,10 +208,11 @@ def strips(grid: Grid, group: np.ndarray) -> np.ndarray:
 
     Args:
         grid: The sparse grid.
+        touching: Its touching pairs of leaves.
         group: Group of every node, named by its first node, -1 = none, shape (M,), i32.
     """
     node = runtime.download(grid.node)[: grid.count]
-    inner = inner_cells(grid, group, group_sizes(grid, group))
+    inner = inner_cells(touching, group, group_sizes(grid, group))
     area = (grid.size / 2.0 ** node[:, LEVEL]) ** 2
     inside = group >= 0
     whole = np.bincount(group[inside], weights=area[inside], minlength=grid.count)

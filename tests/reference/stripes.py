@@ -1,0 +1,192 @@
+"""What happens stripe by stripe: cleaning, spacing, noise, edge-pair normals, registration."""
+
+from __future__ import annotations
+
+import math
+from statistics import NormalDist
+
+import numpy as np
+
+
+def runs(start: np.ndarray) -> list[range]:
+    """Return the rows of every stripe."""
+    return [range(int(a), int(b)) for a, b in zip(start[:-1], start[1:], strict=True)]
+
+
+def to_segment(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+    """Return the distance of a point from a segment."""
+    length = float((b - a) @ (b - a))
+    t = 0.0 if length == 0.0 else min(1.0, max(0.0, float((p - a) @ (b - a)) / length))
+    return float(np.linalg.norm(p - (a + t * (b - a))))
+
+
+def mark_outliers(
+    points: np.ndarray, start: np.ndarray, *, spike: float, isolation: float
+) -> np.ndarray:
+    """Mark points without a neighbour, and points off the three lines through four neighbours."""
+    marked = np.zeros(len(points), int)
+    for stripe in runs(start):
+        for i in stripe:
+            beside = [points[j] for j in (i - 1, i + 1) if j in stripe]
+            if all(np.linalg.norm(points[i] - q) > isolation for q in beside):
+                marked[i] = 1
+                continue
+            if i - 2 not in stripe or i + 2 not in stripe:
+                continue
+            far_left, left, right, far_right = (points[i + k] for k in (-2, -1, 1, 2))
+            off = min(
+                to_segment(points[i], far_left, left),
+                to_segment(points[i], left, right),
+                to_segment(points[i], right, far_right),
+            )
+            if off > spike and np.linalg.norm(left - right) < isolation:
+                marked[i] = 1
+    return marked
+
+
+def stripe_spacing(points: np.ndarray, start: np.ndarray, view: np.ndarray) -> tuple[float, float]:
+    """Return the median distance to the next point, and to the nearest one of the next stripe."""
+    stripes = runs(start)
+    along = [np.linalg.norm(points[i + 1] - points[i]) for s in stripes for i in s[:-1]]
+    across = [
+        np.linalg.norm(points[list(following)] - points[i], axis=1).min()
+        for stripe, following in zip(stripes[:-1], stripes[1:], strict=True)
+        if view[stripe[0]] == view[following[0]]
+        for i in stripe
+    ]
+    return (
+        float(np.median(along)) if along else 0.0,
+        float(np.median(across)) if across else 0.0,
+    )
+
+
+def lower_three_quarters(values: list[float]) -> float:
+    """Return the mean of the lower three quarters, 0 of nothing."""
+    kept = sorted(values)[: max(1, int(0.75 * len(values)))]
+    return math.fsum(kept) / len(kept) if kept else 0.0
+
+
+def stripe_noise(
+    points: np.ndarray, normals: np.ndarray, start: np.ndarray, gap: float
+) -> tuple[float, float]:
+    """Return range noise [mm] and noise of the normals [rad] from second differences."""
+    second, tilt = [], []
+    for stripe in runs(start):
+        for i in stripe:
+            if not normals[i].any():
+                continue
+            p = points[i]
+            if i - 1 in stripe and i + 1 in stripe:
+                a, b = points[i - 1] - p, points[i + 1] - p
+                if max(np.linalg.norm(a), np.linalg.norm(b)) <= gap:
+                    second.append(abs(float((a + b) @ normals[i])))
+            if i - 3 in stripe and i + 3 in stripe:
+                m, n = normals[i - 3], normals[i + 3]
+                if m.any() and n.any() and np.linalg.norm(points[i - 3] - points[i + 3]) <= 6 * gap:
+                    tilt.append(float(np.linalg.norm(normals[i] - (m + n) / 2)))
+    # Expected trimmed means of the distributions that pure noise of unit size would give.
+    normal, q = NormalDist(), NormalDist().inv_cdf(0.875)  # three quarters lie within -q..q
+    half_normal = 2 * (normal.pdf(0) - normal.pdf(q)) / 0.75
+    q = math.sqrt(-2 * math.log(0.25))  # three quarters of a Rayleigh variable lie below q
+    rayleigh = (math.sqrt(math.pi / 2) * math.erf(q / math.sqrt(2)) - q * 0.25) / 0.75
+    # A difference a - 2 p + b has 1 + 4 + 1 variances; n - (m + n) / 2 has 1 + 1/4 + 1/4.
+    noise = lower_three_quarters(second) / half_normal / math.sqrt(6)
+    component = lower_three_quarters(tilt) / rayleigh / math.sqrt(1.5)
+    return noise, component * math.sqrt(2)
+
+
+def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return the cross product, written out."""
+    return np.array(
+        [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+    )
+
+
+def strip_triangles(
+    first: np.ndarray, second: np.ndarray, rule: str, axis: np.ndarray
+) -> list[tuple[int, int, tuple[int, int]]]:
+    """Return the edge pairs between two lines (Fig. 5): origin on the second line, first edge's end
+    on the first, and the new vertex as (line 0 or 1, place)."""
+    triangles = []
+    a, b = 0, 0  # origin: second[a]; end of the first edge: first[b]
+    while a + 1 < len(second) or b + 1 < len(first):
+        if a + 1 == len(second):
+            case = 1
+        elif b + 1 == len(first):
+            case = 2
+        elif rule == "paper":
+            # The distance along y is counted from the origin, with its sign.
+            y_1 = float((first[b + 1] - second[a]) @ axis)
+            y_2 = float((second[a + 1] - second[a]) @ axis)
+            case = 1 if y_1 <= y_2 else 2
+        else:
+            diagonal_1 = math.dist(first[b + 1], second[a])
+            diagonal_2 = math.dist(second[a + 1], first[b])
+            case = 1 if diagonal_1 <= diagonal_2 else 2
+        if case == 1:  # Fig. 5a: the second edge becomes the next first edge
+            triangles.append((a, b, (0, b + 1)))
+            b += 1
+        else:  # Fig. 5b: the origin moves
+            triangles.append((a, b, (1, a + 1)))
+            a += 1
+    return triangles
+
+
+def edge_pair_normals(
+    points: np.ndarray,
+    start: np.ndarray,
+    view: np.ndarray,
+    *,
+    gap: float,
+    rule: str,
+    weight: str,
+    origin: np.ndarray | None,
+) -> np.ndarray:
+    """Return the mean of the normals of all edge pairs that use a point, on the side of the probe."""
+    stripes = runs(start)
+    axes = {}
+    for v in set(view.tolist()):
+        along = sum(points[s[-1]] - points[s[0]] for s in stripes if view[s[0]] == v)
+        length = np.linalg.norm(along)
+        axes[v] = along / length if length > 0 else along
+    total = np.zeros((len(points), 3))
+    for one, two in zip(stripes[:-1], stripes[1:], strict=True):
+        v = int(view[one[0]])
+        if v != view[two[0]]:
+            continue
+        for a, b, (line, place) in strip_triangles(
+            points[list(one)], points[list(two)], rule, axes[v]
+        ):
+            corners = (two[a], one[b], (one, two)[line][place])
+            p, q, r = (points[c] for c in corners)
+            if max(math.dist(p, q), math.dist(q, r), math.dist(r, p)) > gap:
+                continue
+            n = cross(q - p, r - p)
+            if weight == "unit":
+                size = math.hypot(*n)
+                # Three points on a line have no normal.
+                flat = size <= 1e-12 * math.dist(p, q) * math.dist(p, r)
+                n = np.zeros(3) if flat else n / size
+            for c in corners:
+                total[c] += n
+    size = np.linalg.norm(total, axis=1, keepdims=True)
+    normals = np.divide(total, size, out=np.zeros_like(total), where=size > 0)
+    for v in set(view.tolist()):
+        mine = view == v
+        if origin is not None:
+            side = np.sign(np.einsum("ni,ni->n", normals[mine], origin[v] - points[mine]))
+        else:
+            middle = points[mine].mean(axis=0)
+            side = np.sign(np.einsum("ni,ni->n", normals[mine], points[mine] - middle))
+        if side.sum() < 0:
+            normals[mine] = -normals[mine]
+    return normals
+
+
+def to_world(
+    points: np.ndarray, normals: np.ndarray, view: np.ndarray, T_world_view: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Apply the pose of its view to every point."""
+    moved = np.array([(T_world_view[v] @ [*p, 1.0])[:3] for p, v in zip(points, view, strict=True)])
+    turned = np.array([T_world_view[v][:3, :3] @ n for n, v in zip(normals, view, strict=True)])
+    return moved, turned
