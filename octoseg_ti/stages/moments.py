@@ -1,8 +1,8 @@
 """Moments of cells (Eqs 3 and 4): sums that tell mean, deviation and flatness without the points.
 
-A cell has 19 moments, in units of 2^-30: the count; sum N; sum N N'; sum p; sum p p', with p measured
-from the middle of the cell in half cell sizes. They are integers, so a sum depends neither on the
-order of the points nor on the threads.
+A cell has 19 moments, in units of 2^-30: the count; sum N; sum N N'; sum p; sum p p', with p
+measured from the middle of the cell in half cell sizes. They are integers, so a sum depends neither
+on the order of the points nor on the threads.
 """
 
 from typing import Any
