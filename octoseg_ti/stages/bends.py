@@ -286,6 +286,8 @@ def _suspects(
 ) -> dict[int, np.ndarray]:
     """Return the cells of every group that is large and not flat, by the name of the group."""
     inside = np.flatnonzero(group >= 0)
+    if len(inside) == 0:
+        return {}
     order = inside[np.argsort(group[inside], kind="stable")]
     names, first = np.unique(group[order], return_index=True)
     found = {}
