@@ -13,7 +13,12 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.profiling import Trace
 from octoseg_ti.params import PRESETS, Params
 from octoseg_ti.stages.adjacency import find_touching
-from octoseg_ti.stages.assignment import assign_points, points_of_leaves, claimed_share
+from octoseg_ti.stages.assignment import (
+    assign_points,
+    claimed_share,
+    points_of_leaves,
+    to_rows,
+)
 from octoseg_ti.stages.bends import split_at_bends
 from octoseg_ti.stages.cleaning import mark_outliers
 from octoseg_ti.stages.edges import edges_by_level, edges_by_radius, edges_by_reason
@@ -318,13 +323,14 @@ def assemble(
     flat = 2.0 * measured.noise + 0.02 * spacing_of(measured)
     kind, parameters, residual = fit_planes(grid, core, patches, limit=flat)
 
-    row = arranged.row[runtime.download(grid.order)]
     n = len(scans)
-    labels, outlier = np.full(n, NONE, np.int32), np.ones(n, np.uint8)
-    edges, levels = np.zeros(n, np.uint8), np.full(n, -1, np.int8)
-    labels[row], outlier[row] = label, 0
-    edges[row] = points_of_leaves(grid, leaves, edge)
-    levels[row] = points_of_leaves(grid, leaves, node[leaves, LEVEL].astype(np.int8))
+    labels, levels, edges = to_rows(
+        grid, leaves, edge, label, None if arranged.whole else arranged.row, n
+    )
+    outlier = np.zeros(n, np.uint8)
+    if not arranged.whole:
+        outlier[:] = 1
+        outlier[arranged.row] = 0
     if arranged.whole:
         normals, points = normal.astype(np.float32), point
     else:

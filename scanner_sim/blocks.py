@@ -72,8 +72,7 @@ def phone() -> Part:
     The upper casing of a mobile phone: top, four walls and a slanted chin; a screen (floor and four
     slanted walls), twelve keys, a navigation key (ring and dome), an ear dish, a lens dome, a
     button on either side, an antenna (barrel and two round ends). Fillets: the upright corners (3
-    mm), the long rims (2 mm), the ear dish, the navigation key and the buttons (1 and 0.75 mm),
-    the keys (0.75 mm).
+    mm), the long rims (2 mm), the ear dish and the navigation key (1 mm), the keys (0.75 mm).
     """
     body = difference(_casing(), _screen(), _ear(42.0, -1.0, 8.0, 6.0, 1.0))
     keys = union(
@@ -91,7 +90,7 @@ def phone() -> Part:
 
 def _casing() -> Part:
     """Return the body: 110 mm of the length, top at 14 mm, long rims and corners rounded."""
-    low, high, half, top, rim, corner = -60.0, 50.0, 21.75, 14.0, 2.0, 3.0
+    low, high, half, top, rim, corner = -60.0, 50.0, 21.25, 14.0, 2.0, 3.0
     chin = half_space(
         (-51.0, 0.0, top), (-math.sin(math.radians(30)), 0, math.cos(math.radians(30)))
     )
@@ -168,27 +167,17 @@ def _ear(x: float, y: float, ball: float, radius: float, fillet: float) -> Part:
 
 
 def _button(x: float, sign: float) -> Part:
-    """Return a long button on the wall at y = sign * 21.75, as high as its rim is rounded."""
-    wall, length, radius, fillet, z = sign * 21.75, 10.0, 3.75, 0.75, 6.25
-    low, high = x - length / 2, x + length / 2
-    inner, deep, outer = radius - fillet, wall - sign, wall + sign * fillet
-    ends = [
-        union(
-            rod((end, deep, z), (end, outer, z), inner),
-            torus((end, wall, z), (0, 1, 0), inner, fillet, fillet=True),
-        )
-        for end in (low, high)
-    ]
-    bar = box((low, min(deep, outer), z - inner), (high, max(deep, outer), z + inner))
-    rims = [
-        intersection(
-            cylinder((0, wall, height), (1, 0, 0), fillet, fillet=True),
-            half_space((low, 0, 0), (-1, 0, 0)),
-            half_space((high, 0, 0), (1, 0, 0)),
-        )
-        for height in (z - inner, z + inner)
-    ]
-    return union(*ends, bar, *rims)
+    """Return a round button on the wall at y = sign * 21.25: the cap of a ball, 9 mm wide.
+
+    Nowhere is it parallel to the wall beside it. A flat button would hide its lower rim from all
+    views: two parallel faces with no point between them, nearer than a cell of the paper is wide.
+    """
+    wall, radius, height, z = 21.25, 4.5, 1.25, 6.25
+    ball = (radius**2 + height**2) / (2.0 * height)
+    root, deep, outer = height + 1.0, sign * (wall - 1.0), sign * (wall + height)
+    reach = math.sqrt(ball**2 - (ball - root) ** 2)
+    limits = box((x - reach, min(deep, outer), z - reach), (x + reach, max(deep, outer), z + reach))
+    return intersection(sphere((x, outer - sign * ball, z), ball), limits)
 
 
 def _antenna() -> Part:

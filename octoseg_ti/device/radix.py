@@ -16,49 +16,7 @@ _MOST_DIGIT_BITS = 12
 
 
 @ti.kernel
-def _count_digits(
-    n: ti.i32,
-    workers: ti.i32,
-    stride: ti.i32,
-    shift: ti.i32,
-    radix: ti.i32,
-    # In:
-    key_in: I64Array,
-    # Out:
-    count_out: I32Rows,
-):
-    """Count, for every chunk of keys, how often each digit occurs."""
-    chunk = (n + workers - 1) // workers
-    for u in range(workers * stride):
-        if u % stride == 0:
-            w = u // stride
-            for d in range(radix):
-                count_out[w, d] = 0
-            for i in range(w * chunk, ti.min(n, (w + 1) * chunk)):
-                d = ti.cast((key_in[i] >> shift) & (radix - 1), ti.i32)
-                count_out[w, d] = count_out[w, d] + 1
-
-
-@ti.kernel
-def _scan_digits(
-    workers: ti.i32,
-    radix: ti.i32,
-    # Out:
-    count_inout: I32Rows,
-):
-    """Replace the counts by first places: ordered by digit, then by chunk."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        total = 0
-        for d in range(radix):
-            for w in range(workers):
-                here = count_inout[w, d]
-                count_inout[w, d] = total
-                total = total + here
-
-
-@ti.kernel
-def _move(
+def _sort_by_digit(
     n: ti.i32,
     workers: ti.i32,
     stride: ti.i32,
@@ -68,20 +26,36 @@ def _move(
     key_in: I64Array,
     index_in: I32Array,
     # Out:
-    place_inout: I32Rows,
+    place_out: I32Rows,
     key_out: I64Array,
     index_out: I32Array,
 ):
-    """Move every element to the place of its digit, in order within a chunk."""
+    """Sort by one digit: count it in every chunk, scan the counts, move every element to its place."""
     chunk = (n + workers - 1) // workers
+    for u in range(workers * stride):
+        if u % stride == 0:
+            w = u // stride
+            for d in range(radix):
+                place_out[w, d] = 0
+            for i in range(w * chunk, ti.min(n, (w + 1) * chunk)):
+                d = ti.cast((key_in[i] >> shift) & (radix - 1), ti.i32)
+                place_out[w, d] = place_out[w, d] + 1
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        total = 0
+        for d in range(radix):
+            for w in range(workers):  # by digit, then by chunk: equal keys keep their order
+                here = place_out[w, d]
+                place_out[w, d] = total
+                total = total + here
     for u in range(workers * stride):
         if u % stride == 0:
             w = u // stride
             for i in range(w * chunk, ti.min(n, (w + 1) * chunk)):
                 key = key_in[i]
                 d = ti.cast((key >> shift) & (radix - 1), ti.i32)
-                place = place_inout[w, d]
-                place_inout[w, d] = place + 1
+                place = place_out[w, d]
+                place_out[w, d] = place + 1
                 key_out[place] = key
                 index_out[place] = index_in[i]
 
@@ -115,9 +89,9 @@ def sort_pairs(key: Any, index: Any, bits: int) -> tuple[Any, Any]:
     other_key, other_index = runtime.empty(n, np.int64), runtime.empty(n, np.int32)
     for p in range(passes):
         shift, radix = p * digit_bits, 1 << digit_bits
-        _count_digits(n, workers, stride, shift, radix, key, count)
-        _scan_digits(workers, radix, count)
-        _move(n, workers, stride, shift, radix, key, index, count, other_key, other_index)
+        _sort_by_digit(
+            n, workers, stride, shift, radix, key, index, count, other_key, other_index
+        )
         key, other_key = other_key, key
         index, other_index = other_index, index
     return key, index

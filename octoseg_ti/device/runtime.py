@@ -18,6 +18,10 @@ import platformdirs
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 import taichi as ti  # noqa: E402
 
+from octoseg_ti.device import tracing  # noqa: E402
+
+tracing.speed_up(ti.lang.kernel_impl, ti.lang.ast.ast_transformer_utils)
+
 ARCHS = ("cpu", "cuda", "vulkan", "metal")
 
 # A loop of fewer than 512 iterations per thread is not shared between the threads of the CPU

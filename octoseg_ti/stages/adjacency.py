@@ -45,11 +45,29 @@ def _find_touching(
         found = 0
         if child_in[c, 0] == -2:
             level = node_in[c, LEVEL]
+            at = ti.Vector([node_in[c, X], node_in[c, Y], node_in[c, Z]])
+            # The boxes around a cell lie in its parent and in seven boxes of the parent's size, on
+            # the side where the cell is: these are looked up, the rest is one step in the table.
+            side = 2 * (at & 1) - 1
+            above = ti.max(level - 1, 0)
+            up = at >> ti.min(level, 1)
+            parents = ti.Vector([-1] * 8)
+            for o in range(8):
+                p = up + side * ti.Vector([o >> 2, (o >> 1) & 1, o & 1])
+                if level > 0:
+                    parents[o] = find_node(p[0], p[1], p[2], above, shape, depth, root_in, child_in)
             for o in range(27):
-                x = node_in[c, X] + o // 9 - 1
-                y = node_in[c, Y] + (o // 3) % 3 - 1
-                z = node_in[c, Z] + o % 3 - 1
-                b = find_node(x, y, z, level, shape, depth, root_in, child_in)
+                step = ti.Vector([o // 9 - 1, (o // 3) % 3 - 1, o % 3 - 1])
+                box = at + step
+                b = -1
+                if level == 0:
+                    b = find_node(box[0], box[1], box[2], 0, shape, depth, root_in, child_in)
+                else:
+                    beyond = ti.cast(step == side, ti.i32)
+                    b = parents[(beyond[0] << 2) | (beyond[1] << 1) | beyond[2]]
+                    if b >= 0 and child_in[b, 0] != -2:
+                        low = box & 1
+                        b = child_in[b, (low[0] << 2) | (low[1] << 1) | low[2]]
                 if b >= 0 and b < c and child_in[b, 0] == -2:
                     known = 0
                     if node_in[b, LEVEL] < level:  # a coarse cell covers several of the boxes

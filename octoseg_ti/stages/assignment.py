@@ -10,7 +10,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.stages.grid import Grid, find_node
-from octoseg_ti.stages.moments import HI, LO, POINT
+from octoseg_ti.stages.moments import HI, LEVEL, LO, POINT
 from octoseg_ti.types import NONE
 
 _ROUNDS = 3
@@ -106,6 +106,68 @@ def _runs(grid: Grid, index: np.ndarray, bend: np.ndarray | None) -> np.ndarray:
     runs[:, 0], runs[:, 1], runs[:, 3] = index[first], index[last] + 1, first
     runs[:, 2] = NONE if bend is None else bend[first]
     return runs
+
+
+@ti.kernel
+def _scatter(
+    # In:
+    row_in: I32Array,
+    label_in: I32Array,
+    leaf_in: I32Array,
+    level_in: I32Array,
+    edge_in: I32Array,
+    # Out:
+    label_out: I32Array,
+    level_out: I32Array,
+    edge_out: I32Array,
+):
+    """Write label, level and edge class of the sorted points to their rows."""
+    for i in row_in:
+        r = row_in[i]
+        label_out[r] = label_in[i]
+        level_out[r] = level_in[leaf_in[i]]
+        edge_out[r] = edge_in[leaf_in[i]]
+
+
+def to_rows(
+    grid: Grid,
+    leaves: np.ndarray,
+    edge: np.ndarray,
+    label: np.ndarray,
+    row: np.ndarray | None,
+    rows: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bring labels, levels and edge classes of the sorted points into the order of the input.
+
+    Args:
+        grid: The sparse grid.
+        leaves: The nodes that are leaves, in Morton order, shape (C,).
+        edge: `EdgeClass` of every leaf, shape (C,).
+        label: Label of every sorted point, shape (n,), i32.
+        row: Input row of every point of the grid, shape (n,), i64; None = the points as they are.
+        rows: Number of input rows; those of no point get label -1, level -1 and no edge.
+
+    Returns:
+        Labels, shape (rows,), i32; levels, shape (rows,), i8; edge classes, shape (rows,), u8.
+    """
+    runtime.ensure_started()
+    node = runtime.download(grid.node)
+    level = node[leaves, LEVEL]
+    leaf = points_of_leaves(grid, leaves, np.arange(len(leaves), dtype=np.int32))
+    at = grid.order
+    if row is not None:
+        at = runtime.upload(row[runtime.download(grid.order)].astype(np.int32))
+    out = [runtime.upload(np.full(rows, value, np.int32)) for value in (NONE, -1, 0)]
+    _scatter(
+        at,
+        runtime.upload(label),
+        runtime.upload(leaf),
+        runtime.upload(level),
+        runtime.upload(edge.astype(np.int32)),
+        *out,
+    )
+    labels, levels, edges = (runtime.download(a) for a in out)
+    return labels, levels.astype(np.int8), edges.astype(np.uint8)
 
 
 def points_of_leaves(grid: Grid, leaves: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -286,17 +286,17 @@ def _suspects(
 ) -> dict[int, np.ndarray]:
     """Return the cells of every group that is large and not flat, by the name of the group."""
     inside = np.flatnonzero(group >= 0)
-    if len(inside) == 0:
-        return {}
-    order = inside[np.argsort(group[inside], kind="stable")]
-    names, first = np.unique(group[order], return_index=True)
-    found = {}
-    for name, cells in zip(names, np.split(order, first[1:]), strict=True):
-        size = count[cells].sum()
-        # Axes, not directions: without sides a mean of directions means nothing.
-        weighted = normal[cells] * count[cells, None]
-        if size >= min_points:
-            largest = np.linalg.eigvalsh(weighted.T @ normal[cells])[-1] / size
-            if 1.0 - largest > flat**2:
-                found[int(name)] = cells
-    return found
+    names, owner = np.unique(group[inside], return_inverse=True)
+    weight, n = count[inside], normal[inside]
+    size = np.bincount(owner, weights=weight, minlength=len(names))
+    # Axes, not directions: without sides a mean of directions means nothing.
+    tensor = np.empty((len(names), 3, 3))
+    for a, b in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+        sums = np.bincount(owner, weights=weight * n[:, a] * n[:, b], minlength=len(names))
+        tensor[:, a, b] = tensor[:, b, a] = sums / size
+    doubtful = (size >= min_points) & (1.0 - np.linalg.eigvalsh(tensor)[:, 2] > flat**2)
+    order = np.argsort(owner, kind="stable")
+    first = np.searchsorted(owner[order], np.arange(len(names) + 1))
+    return {
+        int(names[g]): inside[order[first[g] : first[g + 1]]] for g in np.flatnonzero(doubtful)
+    }

@@ -91,35 +91,27 @@ def find_node(
 
 @ti.kernel
 def _gather(
+    workers: ti.i32,
+    stride: ti.i32,
+    shift: ti.i32,
     # In:
     corner_in: F64Array,
+    key_in: I64Array,
     order_in: I32Array,
     point_in: F64Rows,
     normal_in: F64Rows,
     # Out:
     point_out: F64Rows,
     normal_out: F64Rows,
+    head_out: I32Array,
 ):
-    """Bring points and normals into Morton order."""
+    """Bring the points into Morton order, and count those of every chunk that begin an initial cell."""
     for i in order_in:
         j = order_in[i]
         for k in ti.static(range(3)):
             point_out[i, k] = point_in[j, k] - corner_in[k]
             normal_out[i, k] = normal_in[j, k]
-
-
-@ti.kernel
-def _count_heads(
-    n: ti.i32,
-    workers: ti.i32,
-    stride: ti.i32,
-    shift: ti.i32,
-    # In:
-    key_in: I64Array,
-    # Out:
-    count_out: I32Array,
-):
-    """Count in every chunk the points that begin an initial cell."""
+    n = key_in.shape[0]
     chunk = (n + workers - 1) // workers
     for u in range(workers * stride):
         if u % stride == 0:
@@ -128,7 +120,7 @@ def _count_heads(
             for i in range(w * chunk, ti.min(n, (w + 1) * chunk)):
                 if i == 0 or (key_in[i] >> shift) != (key_in[ti.max(0, i - 1)] >> shift):
                     heads += 1
-            count_out[w] = heads
+            head_out[w] = heads
 
 
 @ti.kernel
@@ -341,14 +333,13 @@ def build_grid(
     bits = 3 * ((max(shape) - 1).bit_length() + depth)
     key, order = radix.sort_pairs(key, index, max(1, bits))
     sorted_point, sorted_normal = runtime.empty((n, 3), np.float64), runtime.empty((n, 3), np.float64)
-    _gather(
-        runtime.upload(corner), order, point, runtime.upload(normals), sorted_point, sorted_normal
-    )
-
-    roughness = tolerance if edge_tolerance is None else max(tolerance, edge_tolerance)
     workers, stride = runtime.workers()
     heads = runtime.empty(workers, np.int32)
-    _count_heads(n, workers, stride, 3 * depth, key, heads)
+    _gather(
+        workers, stride, 3 * depth, runtime.upload(corner), key, order, point,
+        runtime.upload(normals), sorted_point, sorted_normal, heads,
+    )  # fmt: skip
+    roughness = tolerance if edge_tolerance is None else max(tolerance, edge_tolerance)
     counts = runtime.download(heads)
     count = int(counts.sum())
     place = (np.cumsum(counts) - counts).astype(np.int32)

@@ -9,7 +9,7 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
-from octoseg_ti.device.unionfind import unite
+from octoseg_ti.device.unionfind import find, unite
 from octoseg_ti.stages.adjacency import Adjacency
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.moments import HI, LEVEL, LO, POINT
@@ -57,8 +57,9 @@ def _flood(
     mean_in: F64Rows,
     # Out:
     parent_inout: I32Array,
+    group_out: I32Array,
 ):
-    """Unite every leaf with the touching leaves that agree with it."""
+    """Unite every leaf with the touching leaves that agree with it, then write its root."""
     for c in parent_inout:
         if parent_inout[c] >= 0:
             for k in range(count_in[c]):
@@ -66,23 +67,10 @@ def _flood(
                 if parent_inout[b] >= 0:
                     if _agree(c, b, signed, mean_in, cosine, chord, slack) == 1:
                         unite(parent_inout, c, b)
-
-
-@ti.kernel
-def _flatten(
-    # In:
-    parent_in: I32Array,
-    # Out:
-    group_out: I32Array,
-):
-    """Write the root of every cell."""
-    for c in parent_in:
-        group_out[c] = -1
-        if parent_in[c] >= 0:
-            x = c
-            while parent_in[x] != x:
-                x = parent_in[x]
-            group_out[c] = x
+    for c in parent_inout:
+        group_out[c] = parent_inout[c]
+        if parent_inout[c] >= 0:
+            group_out[c] = find(parent_inout, c)
 
 
 @ti.kernel
@@ -136,7 +124,7 @@ def flood_fill(
     """
     runtime.ensure_started()
     parent = np.where(leaf, np.arange(grid.count, dtype=np.int32), NONE).astype(np.int32)
-    device_parent = runtime.upload(parent)
+    group = runtime.empty(grid.count, np.int32)
     _flood(
         float(np.cos(homogeneity)),
         min(chord, 1e300),
@@ -145,10 +133,9 @@ def flood_fill(
         touching.count,
         touching.neighbor,
         grid.mean,
-        device_parent,
+        runtime.upload(parent),
+        group,
     )
-    group = runtime.empty(grid.count, np.int32)
-    _flatten(device_parent, group)
     return runtime.download(group)
 
 

@@ -25,7 +25,7 @@ SIZES = {"test-block": (100, 60, 33), "phone": (120, 45, 20)}
 KINDS = {
     "two-planes": {SurfaceKind.PLANE: 2},
     "test-block": {SurfaceKind.PLANE: 8, SurfaceKind.CYLINDER: 2, SurfaceKind.SPHERE: 1},
-    "phone": {SurfaceKind.PLANE: 26, SurfaceKind.CYLINDER: 1, SurfaceKind.SPHERE: 5},
+    "phone": {SurfaceKind.PLANE: 24, SurfaceKind.CYLINDER: 1, SurfaceKind.SPHERE: 7},
 }
 
 
