@@ -27,7 +27,7 @@ ISOLATION_SPACINGS = 5.0
 """A point is isolated when its neighbours on the stripe are farther than this many spacings."""
 PATCH_CELLS = 16.0
 """A patch covers at least the area of this many smallest cells: a square of four by four."""
-HOMOGENEITY = (7.0, 0.1, 0.35)
+HOMOGENEITY = (7.0, 0.1, 0.25)
 """Angle between touching cells: this many tolerances, at least and at most so many radians."""
 
 

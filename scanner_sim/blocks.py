@@ -90,7 +90,7 @@ def phone() -> Part:
 
 def _casing() -> Part:
     """Return the body: 110 mm of the length, top at 14 mm, long rims and corners rounded."""
-    low, high, half, top, rim, corner = -60.0, 50.0, 21.25, 14.0, 2.0, 3.0
+    low, high, half, top, rim, corner = -60.0, 50.0, 21.0, 14.0, 2.0, 3.0
     chin = half_space(
         (-51.0, 0.0, top), (-math.sin(math.radians(30)), 0, math.cos(math.radians(30)))
     )
@@ -167,12 +167,12 @@ def _ear(x: float, y: float, ball: float, radius: float, fillet: float) -> Part:
 
 
 def _button(x: float, sign: float) -> Part:
-    """Return a round button on the wall at y = sign * 21.25: the cap of a ball, 9 mm wide.
+    """Return a round button on the wall at y = sign * 21: the cap of a ball, 8 mm wide.
 
     Nowhere is it parallel to the wall beside it. A flat button would hide its lower rim from all
     views: two parallel faces with no point between them, nearer than a cell of the paper is wide.
     """
-    wall, radius, height, z = 21.25, 4.5, 1.25, 6.25
+    wall, radius, height, z = 21.0, 4.0, 1.5, 6.25
     ball = (radius**2 + height**2) / (2.0 * height)
     root, deep, outer = height + 1.0, sign * (wall - 1.0), sign * (wall + height)
     reach = math.sqrt(ball**2 - (ball - root) ** 2)
@@ -182,7 +182,7 @@ def _button(x: float, sign: float) -> Part:
 
 def _antenna() -> Part:
     """Return the antenna: a barrel half sunk into the top, its ends are caps of balls."""
-    y, z, radius, ball = 13.0, 14.0, 6.0, 8.0
+    y, z, radius, ball = 12.5, 14.0, 6.0, 8.0
     height = ball - math.sqrt(ball**2 - radius**2)
     tail, nose = 40.0, 60.0
     barrel = rod((tail, y, z), (nose - height, y, z), radius)
