@@ -43,9 +43,9 @@ def _join(
         lo = run_in[u, 0]
         hi = run_in[u, 1]
         bend = run_in[u, 2]
-        x = ti.cast(point_in[lo, 0] * finest, ti.i32)
-        y = ti.cast(point_in[lo, 1] * finest, ti.i32)
-        z = ti.cast(point_in[lo, 2] * finest, ti.i32)
+        x = ti.min(ti.cast(point_in[lo, 0] * finest, ti.i32), (shape[0] << depth) - 1)
+        y = ti.min(ti.cast(point_in[lo, 1] * finest, ti.i32), (shape[1] << depth) - 1)
+        z = ti.min(ti.cast(point_in[lo, 2] * finest, ti.i32), (shape[2] << depth) - 1)
         before = -1
         for o in range(27):
             c = find_node(
@@ -97,6 +97,7 @@ def _runs(grid: Grid, index: np.ndarray, bend: np.ndarray | None) -> np.ndarray:
         First point, end, bend, and place of the first point in ``index``, shape (r, 4), i32.
     """
     box = (runtime.download(grid.point)[index] * (2.0**grid.depth / grid.size)).astype(np.int32)
+    box = np.minimum(box, np.array(grid.shape) * 2**grid.depth - 1)  # the upper side of the grid
     new = np.ones(len(index), bool)
     new[1:] = (np.diff(index) > 1) | (box[1:] != box[:-1]).any(axis=1)
     first = np.flatnonzero(new)

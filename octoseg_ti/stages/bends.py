@@ -211,8 +211,11 @@ def split_at_bends(
         straight = {}
         for name, cells in suspects.items():
             below = turn[cells] <= bound[name]
-            bound[name] = _valley(turn[cells[below]], count[cells[below]])
-            kept = turn[cells] <= bound[name]
+            limit = _valley(turn[cells[below]], count[cells[below]])
+            if limit >= bound[name]:
+                continue  # what is left turns all alike: no valley below
+            bound[name] = limit
+            kept = turn[cells] <= limit
             if not kept.all() and count[cells[kept]].sum() >= _COVERAGE * count[cells].sum():
                 straight[name] = cells[kept]
         if not straight:

@@ -39,40 +39,47 @@ def edges_by_radius(size: list[float], tolerance: float, radius: float) -> list[
     ]
 
 
-def leaf_at(q: np.ndarray, leaves: list[Leaf], low: np.ndarray, high: np.ndarray) -> Leaf | None:
-    """Return the leaf whose half-open box holds a place, relative to the corner of the grid."""
-    holds = np.flatnonzero(np.all((q >= low) & (q < high), axis=1))
-    return leaves[int(holds[0])] if len(holds) else None
+def leaf_at(box: np.ndarray, leaves: list[Leaf], depth: int) -> Leaf | None:
+    """Return the leaf that holds a smallest box, given by its whole-numbered place."""
+    for c in leaves:
+        if np.array_equal(box >> (depth - c.level), c.place):
+            return c
+    return None
 
 
 def candidates(
     p: np.ndarray,
-    distance: float,
+    reach: int,
     leaves: list[Leaf],
     label: dict[int, int],
     bend: Leaf | None,
     *,
     size: float,
+    shape: tuple[int, ...],
+    depth: int,
     limit: float,
     tight: float,
     angle: float,
 ) -> list[tuple[float, float, int]]:
-    """Return (distance from the plane, distance from the mean point, label) of the cells that fit."""
-    low = np.array([size / 2.0**c.level * c.place for c in leaves])
-    high = np.array([size / 2.0**c.level * (c.place + 1) for c in leaves])
+    """Return (distance from the plane, distance from the mean point, label) of the cells that fit.
+
+    The cells are those at so many smallest boxes from the box of the point, in 26 directions.
+    """
+    last = np.array(shape) * 2**depth - 1
+    box = np.minimum(np.floor(p / (size / 2.0**depth)).astype(int), last)
     found = []
     for step in itertools.product((-1, 0, 1), repeat=3):
-        c = leaf_at(p + distance * np.array(step), leaves, low, high)
+        place = box + reach * np.array(step)
+        if np.any(place < 0) or np.any(place > last):
+            continue
+        c = leaf_at(place, leaves, depth)
         if c is None or label.get(c.node, -1) < 0:
             continue
         off = abs(float((p - c.point) @ c.normal))
-        if off >= limit:
-            continue
         # A point of a bend must lie on the plane, or its cell must look the same way.
-        if bend is not None and off > tight:
-            if abs(float(bend.normal @ c.normal)) < math.cos(angle):
-                continue
-        found.append((off, float(np.linalg.norm(p - c.point)), label[c.node]))
+        other_way = bend is not None and abs(float(bend.normal @ c.normal)) < math.cos(angle)
+        if off <= (tight if other_way else limit):
+            found.append((off, float(np.linalg.norm(p - c.point)), label[c.node]))
     return sorted(found)
 
 

@@ -32,8 +32,7 @@ def test_equals_the_reference(seed: int, n: int) -> None:
     grid, label, bend = made(seed, n)
     nodes, leaves = leaf_nodes(grid), leaves_of(grid)
     fit = {"limit": 0.3, "tight": 0.1, "angle": 0.9}
-    reach = 0.37
-    got = assign_points(grid, nodes, label, bend=bend, reach=reach, **fit)
+    got = assign_points(grid, nodes, label, bend=bend, **fit)
     named = {c.node: int(label[c.node]) for c in leaves}
     points = runtime.download(grid.point)
     i = 0
@@ -44,10 +43,10 @@ def test_equals_the_reference(seed: int, n: int) -> None:
                 assert got[i] == named[c.node], what
             else:
                 expected = {-1}
-                for distance in (reach, 2 * reach, 3 * reach):
+                for reach in (1, 2, 3):
                     fits = plain.candidates(
-                        p, distance, leaves, named, c if bend[c.node] else None,
-                        size=grid.size, **fit,
+                        p, reach, leaves, named, c if bend[c.node] else None,
+                        size=grid.size, shape=grid.shape, depth=grid.depth, **fit,
                     )  # fmt: skip
                     if fits:
                         # Equal distances up to rounding leave the choice open.
@@ -56,6 +55,21 @@ def test_equals_the_reference(seed: int, n: int) -> None:
                 assert got[i] in expected, what
             i += 1
     assert i == n
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_only_some_points_and_rounds(seed: int) -> None:
+    grid, label, bend = made(seed, 300)
+    nodes = leaf_nodes(grid)
+    fit = {"bend": bend, "limit": 0.3, "tight": 0.1, "angle": 0.9}
+    whole = assign_points(grid, nodes, label, **fit)
+    only = np.random.default_rng(seed).random(grid.count) < 0.5
+    part = assign_points(grid, nodes, label, only=only, **fit)
+    before = points_of_leaves(grid, nodes, label[nodes])
+    asked = points_of_leaves(grid, nodes, only[nodes])
+    np.testing.assert_array_equal(part, np.where(asked, whole, before))
+    near = assign_points(grid, nodes, label, rounds=1, **fit)
+    assert np.all((near == whole) | (near == -1)) and np.any(near != whole)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -92,7 +106,7 @@ def test_the_band_of_an_edge_goes_to_its_two_planes() -> None:
     label[nodes] = np.select([mean[nodes, 2] > 0.999, mean[nodes, 0] > 0.999], [0, 1], -1)
     got = assign_points(
         grid, nodes, label, bend=np.zeros(grid.count, bool),
-        reach=0.5, limit=0.125, tight=0.0, angle=0.1,
+        limit=0.125, tight=0.0, angle=0.1,
     )  # fmt: skip
     true = np.where(floor, 0, 1)[runtime.download(grid.order)]
     far = runtime.download(grid.point).max(axis=1) > 0  # not in the edge itself
@@ -114,7 +128,7 @@ def test_far_from_every_plane_is_no_patch() -> None:
     for c in nodes:
         if 500 not in order[node[c, LO] : node[c, HI]]:
             label[c] = 0
-    fit = {"bend": np.zeros(grid.count, bool), "reach": 0.4, "tight": 0.0, "angle": 0.1}
+    fit = {"bend": np.zeros(grid.count, bool), "tight": 0.0, "angle": 0.1}
     alone = int(np.flatnonzero(order == 500)[0])
     assert assign_points(grid, nodes, label, limit=0.1, **fit)[alone] == -1
     assert assign_points(grid, nodes, label, limit=1.0, **fit)[alone] == 0
@@ -135,7 +149,7 @@ def test_points_of_a_bend_join_only_what_looks_their_way() -> None:
     plane = mean[nodes, 2] > 0.9999
     label, bend = np.full(grid.count, -1, np.int32), np.zeros(grid.count, bool)
     label[nodes[plane]], bend[nodes[~plane]] = 0, True
-    fit = {"reach": 0.5, "limit": 0.3, "tight": 0.05}
+    fit = {"limit": 0.3, "tight": 0.05}
     height = runtime.download(grid.point)[:, 2]
     on_bend = points_of_leaves(grid, nodes, bend[nodes])
     strict = assign_points(grid, nodes, label, bend=bend, angle=0.1, **fit)
@@ -148,6 +162,6 @@ def test_without_any_label_nothing_joins() -> None:
     grid, label, bend = made(0, 60)
     got = assign_points(
         grid, leaf_nodes(grid), np.full_like(label, -1), bend=bend,
-        reach=1.0, limit=9.0, tight=9.0, angle=1.0,
+        limit=9.0, tight=9.0, angle=1.0,
     )  # fmt: skip
     assert np.all(got == -1) and len(got) == 60

@@ -8,6 +8,7 @@ from reference import graph as plain
 from reference.clouds import random_cloud, random_surface, rotation, unit
 from reference.device_grid import leaf_nodes, leaves_of, tables
 
+from octoseg_ti.stages.adjacency import find_touching
 from octoseg_ti.stages.bends import split_at_bends, turning
 from octoseg_ti.stages.grid import Grid, build_grid
 from octoseg_ti.stages.moments import STOP
@@ -28,13 +29,13 @@ def test_turning_equals_the_reference(signed: bool, seed: int, n: int) -> None:
         grid = build_grid(points, normals, tolerance=0.08, min_cell=0.9, signed=signed)
     part = np.zeros(grid.count, bool)
     part[leaf_nodes(grid)] = True
-    group = flood_fill(grid, part, homogeneity=0.5)
+    group = flood_fill(grid, find_touching(grid), part, homogeneity=0.5)
     leaves = leaves_of(grid)
     named = {c.node: int(group[c.node]) for c in leaves}
     pairs = plain.touching_pairs(leaves, grid.depth)
     finest = grid.size / 2.0**grid.depth
     for noise in (0.0, 0.1):
-        got = turning(grid, group, noise)
+        got = turning(grid, find_touching(grid), group, noise)
         expected, neighbours = plain.turning(leaves, pairs, named, noise, finest)
         what = f"seed {seed}, n {n}, noise {noise}"
         for node, value in expected.items():
@@ -55,7 +56,7 @@ def test_turning_of_a_cylinder_is_its_curvature(radius: float) -> None:
     grid = build_grid(points, normals, tolerance=0.01, edge_tolerance=0.9, min_cell=cell)
     part = np.zeros(grid.count, bool)
     part[leaf_nodes(grid)] = True
-    turn = turning(grid, np.where(part, 0, -1).astype(np.int32), 0.0)[part]
+    turn = turning(grid, find_touching(grid), np.where(part, 0, -1).astype(np.int32), 0.0)[part]
     assert np.median(turn) == pytest.approx(cell / radius / math.sqrt(2), rel=0.2)
 
 
@@ -70,8 +71,8 @@ def regions(
     )  # fmt: skip
     node, child, _ = tables(grid)
     rule = {"homogeneity": min(0.35, 7 * tolerance), "chord": 0.5 * tolerance, "slack": 0.0}
-    whole = flood_fill(grid, (child[:, 0] == -2) & (node[:, STOP] == 0), **rule)
-    cut = split_at_bends(grid, whole, min_points=60, flat=tolerance, noise=noise, **rule)
+    whole = flood_fill(grid, find_touching(grid), (child[:, 0] == -2) & (node[:, STOP] == 0), **rule)
+    cut = split_at_bends(grid, find_touching(grid), whole, min_points=60, flat=tolerance, noise=noise, **rule)
     return grid, whole, cut, rule
 
 

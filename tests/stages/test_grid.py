@@ -25,8 +25,8 @@ from octoseg_ti.stages.moments import (
 )
 from octoseg_ti.types import StopReason
 
-# Sums are in steps of 2^-30, half a step of error a value.
-STEP = 2.0**-31
+# Values are cut to steps of 2^-30.
+STEP = 2.0**-30
 
 
 def compare(points: np.ndarray, normals: np.ndarray, what: str, **options) -> Grid:

@@ -35,7 +35,7 @@ def test_equals_the_reference(seed: int, n: int) -> None:
             continue
         assert kind[k] == (SurfaceKind.PLANE if rms < 0.1 else SurfaceKind.NONE), what
         if rms < 0.1:
-            # Products are in steps of 2^-36 of half the box squared.
+            # Products are cut to steps of 2^-36 of half the box squared.
             assert residual[k] ** 2 == pytest.approx(rms**2, abs=4 * half**2 * 2.0**-36), what
             np.testing.assert_allclose(parameters[k, :3], middle, atol=half * 1e-9, err_msg=what)
             if np.count_nonzero(label == k) > 20:

@@ -8,6 +8,7 @@ from reference import graph as plain
 from reference.clouds import random_cloud, random_surface, unit
 from reference.device_grid import as_array, leaf_nodes, leaves_of, tables
 
+from octoseg_ti.stages.adjacency import find_touching
 from octoseg_ti.stages.grid import Grid, build_grid
 from octoseg_ti.stages.moments import HI, LEVEL, LO, STOP
 from octoseg_ti.stages.regions import (
@@ -50,7 +51,7 @@ def test_equals_the_reference(signed: bool, seed: int, n: int) -> None:
     pairs = plain.touching_pairs(leaves, grid.depth)
     part = taking_part(grid, seed)
     for homogeneity, chord, slack in ((0.3, math.inf, 0.0), (0.5, 0.1, 0.01), (1.2, 0.4, 0.0)):
-        got = flood_fill(grid, part, homogeneity=homogeneity, chord=chord, slack=slack)
+        got = flood_fill(grid, find_touching(grid), part, homogeneity=homogeneity, chord=chord, slack=slack)
         expected, closest = plain.flood_fill(
             leaves, pairs, lambda c: bool(part[c.node]),
             homogeneity=homogeneity, chord=chord, slack=slack, signed=signed,
@@ -66,16 +67,16 @@ def test_inner_cells_strips_and_numbers_equal_the_reference(seed: int, n: int) -
     grid = made(seed, n)
     leaves = leaves_of(grid)
     pairs = plain.touching_pairs(leaves, grid.depth)
-    group = flood_fill(grid, taking_part(grid, seed), homogeneity=0.4)
+    group = flood_fill(grid, find_touching(grid), taking_part(grid, seed), homogeneity=0.4)
     named = {c.node: int(group[c.node]) for c in leaves if group[c.node] >= 0}
     size = plain.group_sizes(leaves, named)
     what = f"seed {seed}, n {n}"
 
     sizes = group_sizes(grid, group)
     assert {g: int(s) for g, s in enumerate(sizes) if s} == size, what
-    inner = inner_cells(grid, group, sizes)
+    inner = inner_cells(find_touching(grid), group, sizes)
     assert set(np.flatnonzero(inner)) == plain.inner_cells(leaves, pairs, named, size), what
-    found = strips(grid, group)
+    found = strips(grid, find_touching(grid), group)
     assert set(np.flatnonzero(found)) == plain.strips(leaves, pairs, named), what
     for least in (1, 5, 40, 10**6):
         expected = as_array(plain.number_groups(leaves, named, least), grid.count)
@@ -84,9 +85,9 @@ def test_inner_cells_strips_and_numbers_equal_the_reference(seed: int, n: int) -
 
 def test_among_groups_of_equal_size_none_is_larger() -> None:
     grid = made(1, 900)
-    group = flood_fill(grid, taking_part(grid, 1), homogeneity=0.4)
+    group = flood_fill(grid, find_touching(grid), taking_part(grid, 1), homogeneity=0.4)
     assert len(np.unique(group)) > 50
-    inner = inner_cells(grid, group, np.full(grid.count, 7.0))
+    inner = inner_cells(find_touching(grid), group, np.full(grid.count, 7.0))
     np.testing.assert_array_equal(inner, group >= 0)
 
 
@@ -112,7 +113,7 @@ def test_two_planes_are_two_groups(degrees: float) -> None:
     grid = build_grid(points, normals, tolerance=0.02, min_cell=0.8, min_points=3)
     node, child, _ = tables(grid)
     part = (child[:, 0] == -2) & (node[:, STOP] == 0)
-    group = flood_fill(grid, part, homogeneity=math.radians(degrees) / 2)
+    group = flood_fill(grid, find_touching(grid), part, homogeneity=math.radians(degrees) / 2)
     label = number_groups(grid, group, 100)
     assert label.max() == 1
     leaves = leaf_nodes(grid)
@@ -125,7 +126,7 @@ def test_two_planes_are_two_groups(degrees: float) -> None:
         assert len(set(face[of_point == k])) == 1
     assert np.mean(of_point >= 0) > 0.8
     # With a tolerance above the angle the two run into one.
-    joined = number_groups(grid, flood_fill(grid, part, homogeneity=math.radians(degrees) * 1.1), 100)
+    joined = number_groups(grid, flood_fill(grid, find_touching(grid), part, homogeneity=math.radians(degrees) * 1.1), 100)
     assert joined.max() == 0
 
 
@@ -139,9 +140,9 @@ def test_the_chord_tells_parallel_faces_apart() -> None:
     )
     node, child, _ = tables(grid)
     part = (child[:, 0] == -2) & (node[:, STOP] == 0)
-    literal = number_groups(grid, flood_fill(grid, part, homogeneity=0.3), 50)
+    literal = number_groups(grid, flood_fill(grid, find_touching(grid), part, homogeneity=0.3), 50)
     assert literal.max() == 0
-    told = number_groups(grid, flood_fill(grid, part, homogeneity=0.3, chord=0.03), 50)
+    told = number_groups(grid, flood_fill(grid, find_touching(grid), part, homogeneity=0.3, chord=0.03), 50)
     assert told.max() == 1
 
 
@@ -150,14 +151,14 @@ def test_cells_that_touch_at_a_corner_are_neighbours() -> None:
     points = np.array([[0.0, 0, 0], [0.9, 0.9, 0.9], [1.1, 1.1, 1.1], [2.0, 2.0, 2.0]])
     grid = build_grid(points, np.tile([0.0, 0, 1], (4, 1)), tolerance=1.0, divisions=2)
     assert grid.count == 2
-    assert flood_fill(grid, np.ones(2, bool), homogeneity=0.1).tolist() == [0, 0]
+    assert flood_fill(grid, find_touching(grid), np.ones(2, bool), homogeneity=0.1).tolist() == [0, 0]
 
 
 def test_a_gap_of_one_cell_parts() -> None:
     points = np.array([[0.0, 0, 0], [0.5, 0, 0], [2.5, 0, 0], [3.0, 1.0, 0]])
     grid = build_grid(points, np.tile([0.0, 0, 1], (4, 1)), tolerance=1.0, divisions=1)
     assert grid.count == 2 and grid.size == 1.0
-    assert flood_fill(grid, np.ones(2, bool), homogeneity=0.1).tolist() == [0, 1]
+    assert flood_fill(grid, find_touching(grid), np.ones(2, bool), homogeneity=0.1).tolist() == [0, 1]
 
 
 def test_cells_of_very_different_size_touch() -> None:
@@ -180,13 +181,13 @@ def test_cells_of_very_different_size_touch() -> None:
         leaves, plain.touching_pairs(leaves, grid.depth), lambda c: True,
         homogeneity=0.1, chord=math.inf, slack=0.0, signed=True,
     )  # fmt: skip
-    group = flood_fill(grid, part, homogeneity=0.1)
+    group = flood_fill(grid, find_touching(grid), part, homogeneity=0.1)
     np.testing.assert_array_equal(group, as_array(expected, grid.count))
 
 
 def test_nothing_takes_part() -> None:
     grid = made(0, 60)
-    group = flood_fill(grid, np.zeros(grid.count, bool), homogeneity=0.3)
+    group = flood_fill(grid, find_touching(grid), np.zeros(grid.count, bool), homogeneity=0.3)
     assert np.all(group == -1)
     assert np.all(number_groups(grid, group, 1) == -1)
-    assert not strips(grid, group).any()
+    assert not strips(grid, find_touching(grid), group).any()
