@@ -159,7 +159,8 @@ def _arranged(
     normals = scans.normals
     if normals is not None:
         size = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = np.divide(normals, size, out=np.zeros_like(normals), where=size > 0)[row]
+        usable = np.isfinite(size) & (size > 0)
+        normals = np.divide(normals, size, out=np.zeros_like(normals), where=usable)[row]
     return Arranged(
         row=row,
         points=scans.points if whole else scans.points[row],
