@@ -31,9 +31,7 @@ def test_every_open_value_is_filled_in() -> None:
 
 def test_lengths_follow_the_larger_spacing() -> None:
     small = derive(Params(), CLEAN)
-    large = derive(
-        Params(), replace(CLEAN, spacing_along=2.0, spacing_across=5.0, noise=0.01)
-    )
+    large = derive(Params(), replace(CLEAN, spacing_along=2.0, spacing_across=5.0, noise=0.01))
     assert small.grid.min_cell == pytest.approx(1.8 * 0.5)
     for section, key in (
         ("cleaning", "spike"), ("cleaning", "isolation"), ("normals", "gap"), ("grid", "min_cell"),

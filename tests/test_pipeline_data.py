@@ -11,7 +11,9 @@ from octoseg_ti import SurfaceKind, evaluate, read, segment
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
-@pytest.mark.parametrize(("part", "patches"), [("two-planes", 2), ("test-block", 11), ("phone", 32)])
+@pytest.mark.parametrize(
+    ("part", "patches"), [("two-planes", 2), ("test-block", 11), ("phone", 32)]
+)
 def test_simulated_parts_are_segmented_without_a_fault(
     part: str, patches: int, noise: float
 ) -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from conftest import make_tent
 
-from octoseg_ti import DataError, Scans, Segmentation, paper, segment
-from octoseg_ti.params import PRESETS
+from octoseg_ti import DataError, Params, Scans, Segmentation, paper, segment
+from octoseg_ti.params import PRESETS, GridParams
 
 
 def check(result: Segmentation, n: int) -> None:
@@ -31,6 +31,9 @@ def cloud(kind: str) -> np.ndarray:
         "collinear": np.outer(np.linspace(0, 5, 100), [1.0, 2.0, 3.0]),
         "collinear twice": np.repeat(np.outer(np.arange(50.0), [1.0, 0, 0]), 2, axis=0),
         "plane": np.column_stack((rng.uniform(0, 9, (300, 2)), np.zeros(300))),
+        "plane twice": np.repeat(
+            np.column_stack((rng.uniform(0, 9, (300, 2)), np.zeros(300))), 2, axis=0
+        ),
         "all nan": np.full((50, 3), np.nan),
         "all inf": np.full((50, 3), np.inf),
         "two finite": np.concatenate((np.eye(3)[:2], np.full((50, 3), np.nan))),
@@ -51,7 +54,7 @@ ERRORS = {
     "all inf": "0 of 50 points can be used",
     "two finite": "2 of 52 points can be used",
 }
-FINE = ["three", "four", "plane", "collinear", "collinear twice", "two places", "blob", "tiny"]
+FINE = ["three", "four", "plane", "collinear", "collinear twice", "plane twice", "blob", "tiny"]
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -72,6 +75,16 @@ def test_meagre_clouds_get_an_answer(kind: str, preset: str) -> None:
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_two_places_have_no_spacing() -> None:
+    points = cloud("two places")
+    with pytest.raises(DataError, match=r"no spacing .*coincide.*grid.min_cell"):
+        segment(points)
+    given = Params(grid=GridParams(min_cell=0.5))
+    check(segment(points, given), 100)
+    check(segment(points, preset="paper"), 100)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("kind", ["far pair", "huge", "needle"])
 def test_extreme_extents_get_an_answer_or_a_clear_line(kind: str) -> None:
     points = cloud(kind)
@@ -79,7 +92,7 @@ def test_extreme_extents_get_an_answer_or_a_clear_line(kind: str) -> None:
         try:
             check(segment(points, preset=preset), len(points))
         except DataError as error:
-            assert "cell" in str(error) and "\n" not in str(error)  # noqa: PT017
+            assert "cell" in str(error) and "\n" not in str(error)
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -99,7 +112,7 @@ def test_meagre_stripes_get_an_answer_or_a_clear_line(kind: str, split: str) -> 
         try:
             check(segment(points, stripe=stripe, view=view, preset=preset), n)
         except DataError as error:
-            assert "\n" not in str(error)  # noqa: PT017
+            assert "\n" not in str(error)
 
 
 def test_one_stripe_is_refused_with_advice(tent) -> None:

@@ -267,10 +267,15 @@ def _lay_out(
     thick = extent[extent > 1e-9 * longest]
     if divisions is not None:
         size = float(thick.min()) / divisions
-    else:
+    elif min_cell > 0.0:
         size = min_cell * 2.0**_DEFAULT_LEVELS
         while np.prod(_cells_along(extent, size)) > _MOST_ROOTS:
             size *= 2.0
+    else:
+        raise DataError(
+            "no spacing of the points can be measured: too many of them coincide",
+            hint="set the smallest cell (grid.min_cell)",
+        )
     cells = _cells_along(extent, size)
     if np.prod(cells) > _MOST_ROOTS:
         raise DataError(
@@ -328,7 +333,8 @@ def build_grid(
         The grid, all arrays on the device.
 
     Raises:
-        DataError: All points coincide, or the cells are too small for the box.
+        DataError: All points coincide, the cells are too small for the box, or there is neither a
+            number of divisions nor a smallest cell.
     """
     runtime.ensure_started()
     n = len(points)

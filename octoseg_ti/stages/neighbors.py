@@ -81,7 +81,7 @@ def neighbor_normals(
 
     Returns:
         Unit normals, shape (N, 3), f64, zero where the neighbours define no plane; and the
-        measurement: the spacing is the median distance to the nearest neighbour, the noise the rms
+        measurement: the spacing is the median distance to the nearest other place, the noise the rms
         distance from the planes, the noise of the normals what that makes of a plane fit.
 
     Raises:
@@ -105,7 +105,9 @@ def neighbor_normals(
         normal,
         height,
     )
-    nearest = distance[:, 1][distance[:, 1] > 0]
+    # The nearest other place: points may coincide, where clouds were merged even all of them.
+    nearest = np.min(distance, axis=1, where=distance > 0, initial=np.inf)
+    nearest = nearest[np.isfinite(nearest)]
     spacing = float(np.median(nearest)) if len(nearest) else 0.0
     off = np.sort(runtime.download(height))
     off = off[off >= 0]

@@ -71,7 +71,11 @@ def random_surface(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
     normals[pipe] = round_[pipe]
     height = np.abs(v)
     shell = np.column_stack(
-        (np.sqrt(1 - height**2) * np.cos(2 * turn), np.sqrt(1 - height**2) * np.sin(2 * turn), height)
+        (
+            np.sqrt(1 - height**2) * np.cos(2 * turn),
+            np.sqrt(1 - height**2) * np.sin(2 * turn),
+            height,
+        )
     )
     points[ball] = ([40.0, 0.0, 0.0] + 8.0 * shell)[ball]
     normals[ball] = shell[ball]

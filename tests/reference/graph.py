@@ -116,9 +116,7 @@ def group_sizes(leaves: list[Leaf], group: dict[int, int]) -> dict[int, int]:
     return size
 
 
-def strips(
-    leaves: list[Leaf], pairs: list[tuple[Leaf, Leaf]], group: dict[int, int]
-) -> set[int]:
+def strips(leaves: list[Leaf], pairs: list[tuple[Leaf, Leaf]], group: dict[int, int]) -> set[int]:
     """Return the leaves of groups that have less than half of their area in inner cells."""
     inner = inner_cells(leaves, pairs, group, group_sizes(leaves, group))
     found = set()

@@ -21,8 +21,8 @@ def neighbor_normals(
     for i in range(n):
         distance = np.linalg.norm(points - points[i], axis=1)
         others = np.sort(np.delete(distance, i))
-        if others[0] > 0:
-            nearest.append(others[0])
+        if others[k - 1] > 0:
+            nearest.append(next(d for d in others if d > 0))
         radius = others[k - 1] if others[k - 1] > 0 else 1.0
         radii.append(radius)
         near = points[distance < radius]

@@ -51,7 +51,9 @@ def test_turning_of_a_cylinder_is_its_curvature(radius: float) -> None:
     rng = np.random.default_rng(0)
     angle = rng.uniform(0.3, math.pi - 0.3, 30_000)
     normals = np.column_stack((0 * angle, np.cos(angle), np.sin(angle)))
-    points = radius * normals + np.column_stack((rng.uniform(0, 3 * radius, 30_000), 0 * angle, 0 * angle))
+    points = radius * normals + np.column_stack(
+        (rng.uniform(0, 3 * radius, 30_000), 0 * angle, 0 * angle)
+    )
     cell = radius / 12
     grid = build_grid(points, normals, tolerance=0.01, edge_tolerance=0.9, min_cell=cell)
     part = np.zeros(grid.count, bool)
@@ -71,8 +73,12 @@ def regions(
     )  # fmt: skip
     node, child, _ = tables(grid)
     rule = {"homogeneity": min(0.35, 7 * tolerance), "chord": 0.5 * tolerance, "slack": 0.0}
-    whole = flood_fill(grid, find_touching(grid), (child[:, 0] == -2) & (node[:, STOP] == 0), **rule)
-    cut = split_at_bends(grid, find_touching(grid), whole, min_points=60, flat=tolerance, noise=noise, **rule)
+    whole = flood_fill(
+        grid, find_touching(grid), (child[:, 0] == -2) & (node[:, STOP] == 0), **rule
+    )
+    cut = split_at_bends(
+        grid, find_touching(grid), whole, min_points=60, flat=tolerance, noise=noise, **rule
+    )
     return grid, whole, cut, rule
 
 

@@ -107,9 +107,7 @@ def test_the_paper_settings_equal_the_reference(tolerance: float, seed: int) -> 
     points[:3], normals[:3] = points[3], normals[3]  # coincident, of one mind
     points[4] = points[5]  # coincident, of two minds: only the depth limit ends that
     normals[4:6] = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]
-    grid = compare(
-        points, normals, f"seed {seed}", tolerance=tolerance, divisions=12, min_points=2
-    )
+    grid = compare(points, normals, f"seed {seed}", tolerance=tolerance, divisions=12, min_points=2)
     node, child, _ = tables(grid)
     stops = set(node[child[:, 0] == -2, STOP].tolist())
     assert int(StopReason.FEW_POINTS) not in stops  # a single normal has no deviation
@@ -210,9 +208,7 @@ def test_two_planes(theta: float, share: float) -> None:
     """Normals theta apart, shares p and 1 - p: 2 sin(theta / 2) sqrt(p (1 - p))."""
     n = 1000
     first = np.arange(n) < share * n
-    normals = np.where(
-        first[:, None], [math.sin(theta), 0.0, math.cos(theta)], [0.0, 0.0, 1.0]
-    )
+    normals = np.where(first[:, None], [math.sin(theta), 0.0, math.cos(theta)], [0.0, 0.0, 1.0])
     points = np.random.default_rng(1).uniform(0, 5, (n, 3))
     sigma, _ = one_cell(points, normals)
     p = first.mean()
@@ -235,7 +231,7 @@ def test_many_points_do_not_wear_out_the_sums() -> None:
     normals = unit(np.column_stack((tilt, np.ones(300_000))))
     sigma, _ = one_cell(rng.uniform(0, 5, (300_000, 3)), normals)
     exact = math.sqrt(np.mean(np.sum((normals - normals.mean(axis=0)) ** 2, axis=1)))
-    assert sigma == pytest.approx(exact, rel=1e-6)
+    assert sigma == pytest.approx(exact, rel=1e-5)
     assert sigma == pytest.approx(0.0091, rel=5e-3)
 
 
@@ -260,9 +256,7 @@ def test_leaves_of_a_cylinder_have_the_size_of_its_radius() -> None:
     grid = build_grid(points, normals, tolerance=0.05, divisions=1)
     node, _, _ = tables(grid)
     leaves = leaf_nodes(grid)
-    size = np.repeat(
-        grid.size / 2.0 ** node[leaves, LEVEL], node[leaves, HI] - node[leaves, LO]
-    )
+    size = np.repeat(grid.size / 2.0 ** node[leaves, LEVEL], node[leaves, HI] - node[leaves, LO])
     law = math.sqrt(12) * 0.05 * 10.0
     # A cell on the slope holds up to sqrt(2) times its size of the arc, a corner of a cell less.
     assert np.all(size > law / 2 / math.sqrt(2))
@@ -343,6 +337,7 @@ def test_layout_of_the_reference_is_the_same() -> None:
     ("points", "options", "message"),
     [
         (np.full((5, 3), 3.0), {"min_cell": 1.0}, "all points coincide"),
+        (np.eye(3), {}, "no spacing of the points can be measured"),
         (np.array([[0.0, 0, 0], [1e9, 1, 1], [5, 5, 1]]), {"divisions": 50}, "fewer divisions"),
         (np.array([[0.0, 0, 0], [1e9, 1e9, 1], [5, 5, 1]]), {"min_cell": 1e-6}, "too small"),
     ],

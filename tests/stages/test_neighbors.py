@@ -77,6 +77,17 @@ def test_coincident_points_have_no_normal() -> None:
     assert measured.spacing_along == 0.0
 
 
+@pytest.mark.parametrize("times", [2, 3])
+def test_spacing_of_points_that_are_all_there_several_times(times: int) -> None:
+    points, _ = random_surface(2, 300)
+    outward = np.tile([0.0, 0.0, 1.0], (300, 1))
+    _, once = neighbor_normals(points, outward, 12)
+    _, several = neighbor_normals(
+        np.repeat(points, times, axis=0), np.repeat(outward, times, 0), 12
+    )
+    assert several.spacing_along == once.spacing_along > 0
+
+
 def test_too_few_neighbors_are_refused() -> None:
     with pytest.raises(ValueError, match="at least 3, not 2"):
         neighbor_normals(np.zeros((9, 3)), np.ones((9, 3)), 2)

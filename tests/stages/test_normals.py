@@ -14,9 +14,7 @@ from octoseg_ti.stages.normals import edge_pair_normals, stripe_axes
 @pytest.mark.parametrize("weight", ["unit", "area"])
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("stripes", "length"), [(2, 3), (3, 10), (9, 30), (20, 60)])
-def test_equals_the_reference(
-    rule: str, weight: str, seed: int, stripes: int, length: int
-) -> None:
+def test_equals_the_reference(rule: str, weight: str, seed: int, stripes: int, length: int) -> None:
     points, start, _, view = ragged_stripes(seed, stripes, length, views=2)
     origin = np.array([[5.0, 10.0, 200.0], [5.0, 10.0, 230.0]])
     for gap in (1.2, 1e9):
@@ -102,9 +100,7 @@ def test_six_triangles_of_a_lattice_point() -> None:
     around = [t for t in triangles if 4 in t]
     total = sum(
         -n / np.linalg.norm(n)
-        for n in (
-            np.cross(points[q] - points[p], points[r] - points[p]) for p, q, r in around
-        )
+        for n in (np.cross(points[q] - points[p], points[r] - points[p]) for p, q, r in around)
     )
     np.testing.assert_allclose(got[4], total / np.linalg.norm(total), atol=1e-14)
 

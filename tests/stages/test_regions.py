@@ -24,9 +24,7 @@ def made(seed: int, n: int, signed: bool = True) -> Grid:
     """Return a grid of many cell sizes."""
     if seed % 2:
         points, normals = random_cloud(seed, n)
-        return build_grid(
-            points, normals, tolerance=0.6, divisions=2, min_cell=0.2, signed=signed
-        )
+        return build_grid(points, normals, tolerance=0.6, divisions=2, min_cell=0.2, signed=signed)
     points, normals = random_surface(seed, n)
     normals = unit(normals + 0.05 * np.random.default_rng(seed).standard_normal(normals.shape))
     if not signed:
@@ -51,7 +49,9 @@ def test_equals_the_reference(signed: bool, seed: int, n: int) -> None:
     pairs = plain.touching_pairs(leaves, grid.depth)
     part = taking_part(grid, seed)
     for homogeneity, chord, slack in ((0.3, math.inf, 0.0), (0.5, 0.1, 0.01), (1.2, 0.4, 0.0)):
-        got = flood_fill(grid, find_touching(grid), part, homogeneity=homogeneity, chord=chord, slack=slack)
+        got = flood_fill(
+            grid, find_touching(grid), part, homogeneity=homogeneity, chord=chord, slack=slack
+        )
         expected, closest = plain.flood_fill(
             leaves, pairs, lambda c: bool(part[c.node]),
             homogeneity=homogeneity, chord=chord, slack=slack, signed=signed,
@@ -101,9 +101,7 @@ def plane_and_wall(angle: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray,
         face[:, None] == 0, np.column_stack((u, 0 * u[:, 0])),
         u[:, :1] * side + np.column_stack((0 * u[:, 0], u[:, 1], 0 * u[:, 0])),
     )  # fmt: skip
-    normals = np.where(
-        face[:, None] == 0, [0.0, 0.0, 1.0], [math.sin(angle), 0.0, math.cos(angle)]
-    )
+    normals = np.where(face[:, None] == 0, [0.0, 0.0, 1.0], [math.sin(angle), 0.0, math.cos(angle)])
     return points, normals, face
 
 
@@ -126,7 +124,11 @@ def test_two_planes_are_two_groups(degrees: float) -> None:
         assert len(set(face[of_point == k])) == 1
     assert np.mean(of_point >= 0) > 0.8
     # With a tolerance above the angle the two run into one.
-    joined = number_groups(grid, flood_fill(grid, find_touching(grid), part, homogeneity=math.radians(degrees) * 1.1), 100)
+    joined = number_groups(
+        grid,
+        flood_fill(grid, find_touching(grid), part, homogeneity=math.radians(degrees) * 1.1),
+        100,
+    )
     assert joined.max() == 0
 
 
@@ -135,14 +137,14 @@ def test_the_chord_tells_parallel_faces_apart() -> None:
     points = rng.uniform(0, 10, (4000, 3))
     points[:, 2] = np.where(points[:, 0] < 5.0, 0.0, 0.7)
     normals = np.tile([0.0, 0.0, 1.0], (4000, 1))
-    grid = build_grid(
-        points, normals, tolerance=0.05, min_cell=0.6, min_points=3, flatness=0.25
-    )
+    grid = build_grid(points, normals, tolerance=0.05, min_cell=0.6, min_points=3, flatness=0.25)
     node, child, _ = tables(grid)
     part = (child[:, 0] == -2) & (node[:, STOP] == 0)
     literal = number_groups(grid, flood_fill(grid, find_touching(grid), part, homogeneity=0.3), 50)
     assert literal.max() == 0
-    told = number_groups(grid, flood_fill(grid, find_touching(grid), part, homogeneity=0.3, chord=0.03), 50)
+    told = number_groups(
+        grid, flood_fill(grid, find_touching(grid), part, homogeneity=0.3, chord=0.03), 50
+    )
     assert told.max() == 1
 
 
@@ -151,14 +153,20 @@ def test_cells_that_touch_at_a_corner_are_neighbours() -> None:
     points = np.array([[0.0, 0, 0], [0.9, 0.9, 0.9], [1.1, 1.1, 1.1], [2.0, 2.0, 2.0]])
     grid = build_grid(points, np.tile([0.0, 0, 1], (4, 1)), tolerance=1.0, divisions=2)
     assert grid.count == 2
-    assert flood_fill(grid, find_touching(grid), np.ones(2, bool), homogeneity=0.1).tolist() == [0, 0]
+    assert flood_fill(grid, find_touching(grid), np.ones(2, bool), homogeneity=0.1).tolist() == [
+        0,
+        0,
+    ]
 
 
 def test_a_gap_of_one_cell_parts() -> None:
     points = np.array([[0.0, 0, 0], [0.5, 0, 0], [2.5, 0, 0], [3.0, 1.0, 0]])
     grid = build_grid(points, np.tile([0.0, 0, 1], (4, 1)), tolerance=1.0, divisions=1)
     assert grid.count == 2 and grid.size == 1.0
-    assert flood_fill(grid, find_touching(grid), np.ones(2, bool), homogeneity=0.1).tolist() == [0, 1]
+    assert flood_fill(grid, find_touching(grid), np.ones(2, bool), homogeneity=0.1).tolist() == [
+        0,
+        1,
+    ]
 
 
 def test_cells_of_very_different_size_touch() -> None:

@@ -39,9 +39,7 @@ def test_normals_of_views_of_one_plane_agree() -> None:
     T_world_view = poses(7, 3)
     view = np.repeat(np.arange(3, dtype=np.int32), len(world))
     back = np.linalg.inv(T_world_view)
-    local = np.concatenate(
-        [world @ back[v, :3, :3].T + back[v, :3, 3] for v in range(3)]
-    )
+    local = np.concatenate([world @ back[v, :3, :3].T + back[v, :3, 3] for v in range(3)])
     start = (25 * np.arange(37)).astype(np.int32)
     probe = np.array([[3.0, 5.0, 400.0]] * 3) + rng.standard_normal((3, 3))
     origin = np.einsum("vij,vj->vi", back[:, :3, :3], probe) + back[:, :3, 3]
