@@ -270,8 +270,12 @@ def claimed_share(
     Returns:
         Share of labelled points, 0 for an empty group, shape (G,), f64.
     """
-    of_point = points_of_leaves(grid, leaves, group[leaves])
+    node = runtime.download(grid.node)
+    of_leaf = group[leaves]
+    inside = of_leaf >= 0
     groups = int(group.max(initial=NONE)) + 1
-    total = np.bincount(of_point[of_point >= 0], minlength=groups)
-    labelled = np.bincount(of_point[(of_point >= 0) & (label >= 0)], minlength=groups)
-    return labelled / np.maximum(total, 1)
+    labelled = np.add.reduceat((label >= 0).astype(np.int32), node[leaves, LO])[inside]
+    count = (node[leaves, HI] - node[leaves, LO])[inside]
+    total = np.bincount(of_leaf[inside], weights=count, minlength=groups)
+    found = np.bincount(of_leaf[inside], weights=labelled, minlength=groups)
+    return found / np.maximum(total, 1)

@@ -29,10 +29,7 @@ NORMAL, POINT, SIGMA, RESIDUAL = 0, 3, 6, 7
 @ti.func
 def _fixed(x: ti.f64) -> ti.i64:
     """Return a value of -1..1 in fixed point."""
-    half = 0.5
-    if x < 0.0:
-        half = -0.5
-    return ti.cast(x * _ONE + half, ti.i64)
+    return ti.cast(x * _ONE + ti.select(x < 0.0, -0.5, 0.5), ti.i64)
 
 
 @ti.kernel
