@@ -1,4 +1,4 @@
-"""octoseg: from the scan lines of a stripe laser scanner to the patches, edges and surfaces of a part.
+"""From the scan lines of a stripe laser scanner to the patches, edges and surfaces of a part.
 
 Names are resolved when they are first used, so that importing the package stays cheap and needs
 neither Taichi nor Rerun nor MCAP.

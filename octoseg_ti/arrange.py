@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -52,7 +53,7 @@ def as_scans(
     if len(points) == 0:
         raise DataError("there are no points")
     n = len(points)
-    checked = {
+    checked: dict[str, Any] = {
         "points": points,
         "normals": None if scans.normals is None else _rows("normals", scans.normals, n),
         "stripe": _numbers("stripe", scans.stripe, n),
@@ -86,7 +87,9 @@ def _rows(name: str, value: np.ndarray, n: int | None) -> np.ndarray:
     if array.dtype.kind not in "fiu":
         raise DataError(f"{name} must be numbers, not {array.dtype}")
     if array.ndim != 2 or array.shape[1] != 3 or (n is not None and len(array) != n):
-        raise DataError(f"{name} must have the shape ({'N' if n is None else n}, 3), not {array.shape}")
+        raise DataError(
+            f"{name} must have the shape ({'N' if n is None else n}, 3), not {array.shape}"
+        )
     return np.ascontiguousarray(array, np.float64)
 
 
@@ -156,7 +159,8 @@ def _arranged(
     normals = scans.normals
     if normals is not None:
         size = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = np.divide(normals, size, out=np.zeros_like(normals), where=size > 0)[row]
+        usable = np.isfinite(size) & (size > 0)
+        normals = np.divide(normals, size, out=np.zeros_like(normals), where=usable)[row]
     return Arranged(
         row=row,
         points=scans.points if whole else scans.points[row],

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -30,7 +31,7 @@ class NormalParams:
     """Point normals from edge pairs of neighbouring stripes (N1-N9)."""
 
     rule: Literal["diagonal", "paper"] = "diagonal"
-    """Next point of the march: the shorter diagonal, or literally the candidate nearest the origin."""
+    """Next point of the march: by the shorter diagonal, or by the distance along y (the paper)."""
     gap: float | None = None
     """Longest edge of a triangle [mm]; longer ones break the strip. Default: from the spacing."""
     weight: Literal["unit", "area"] = "unit"
@@ -47,7 +48,7 @@ class GridParams:
     """Cells along the shortest side of the bounding box; default: the cell is a power of two
     times the smallest cell."""
     tolerance: float | None = None
-    """Largest deviation of the normals in a cell (Eq. 4), 0..1; default: from the noise of the normals."""
+    """Largest deviation of the normals in a cell (Eq. 4), 0..1; default: from their noise."""
     edge_tolerance: float | None = None
     """Largest deviation of the normals in a smallest cell that is no edge; default: from the noise
     and the spacing. Below ``tolerance`` it has no effect."""
@@ -76,7 +77,7 @@ class RegionParams:
     """Flood fill over touching cells (S4-S7), and what happens to the points left over."""
 
     homogeneity: float | None = None
-    """Largest angle between the mean normals of touching cells [rad]; default: from the tolerance."""
+    """Largest angle between the normals of touching cells [rad]; default: from the tolerance."""
     min_points: int | None = None
     """A group with fewer points is no patch; default: from the smallest cell and the spacing."""
     assign_edges: bool = True
@@ -104,22 +105,37 @@ class Params:
         Raises:
             ValueError: A key is unknown; the message names it.
         """
-        sections = {f.name: f.default_factory for f in dataclasses.fields(cls)}
+        sections: dict[str, Any] = {
+            "cleaning": CleaningParams,
+            "normals": NormalParams,
+            "grid": GridParams,
+            "edges": EdgeParams,
+            "regions": RegionParams,
+        }
         built = {}
         for name, section in values.items():
             if name not in sections:
-                raise ValueError(f"unknown parameter section {name!r}; known: {', '.join(sections)}")
-            known = {f.name for f in dataclasses.fields(type(sections[name]()))}  # type: ignore[misc]
+                raise ValueError(
+                    f"unknown parameter section {name!r}; known: {', '.join(sections)}"
+                )
+            known = {f.name for f in dataclasses.fields(sections[name])}
             for key in section:
                 if key not in known:
-                    raise ValueError(f"unknown parameter {name}.{key}; known: {', '.join(sorted(known))}")
-            built[name] = type(sections[name]())(**section)  # type: ignore[misc]
+                    raise ValueError(
+                        f"unknown parameter {name}.{key}; known: {', '.join(sorted(known))}"
+                    )
+            built[name] = sections[name](**section)
         return cls(**built)
 
 
 def paper(
-    *, divisions: int = 12, tolerance: float = 0.01, smallest_levels: int = 4, fillet_levels: int = 0,
-    homogeneity: float = math.radians(20.0), min_points: int = 30,
+    *,
+    divisions: int = 12,
+    tolerance: float = 0.01,
+    smallest_levels: int = 4,
+    fillet_levels: int = 0,
+    homogeneity: float = math.radians(20.0),
+    min_points: int = 30,
 ) -> Params:
     """Return the parameters of the literal method of Woo et al. 2002, with its user values.
 
@@ -141,10 +157,23 @@ def paper(
             min_cell=0.0,
             min_points=2,
         ),
-        edges=EdgeParams(rule="levels", smallest_levels=smallest_levels, fillet_levels=fillet_levels),
+        edges=EdgeParams(
+            rule="levels", smallest_levels=smallest_levels, fillet_levels=fillet_levels
+        ),
         regions=RegionParams(homogeneity=homogeneity, min_points=min_points, assign_edges=False),
     )
 
 
-PRESETS = {"default": Params, "paper": paper}
+PRESETS: dict[str, Callable[[], Params]] = {"default": Params, "paper": paper}
 """Named parameter sets."""
+
+
+def preset_params(name: str) -> Params:
+    """Return the parameters of a preset.
+
+    Raises:
+        ValueError: There is no such preset; the message names those there are.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"preset must be one of {', '.join(PRESETS)}, not {name!r}")
+    return PRESETS[name]()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from octoseg_ti.arrange import Arranged, arrange, as_scans
 from octoseg_ti.defaults import derive, spacing_of
 from octoseg_ti.device import runtime
 from octoseg_ti.device.profiling import Trace
-from octoseg_ti.params import PRESETS, Params
+from octoseg_ti.params import Params, preset_params
 from octoseg_ti.stages.adjacency import find_touching
 from octoseg_ti.stages.assignment import (
     assign_points,
@@ -83,9 +84,7 @@ def segment(
         ValueError: Unknown preset.
     """
     if params is None:
-        if preset not in PRESETS:
-            raise ValueError(f"preset must be one of {', '.join(PRESETS)}, not {preset!r}")
-        params = PRESETS[preset]()
+        params = preset_params(preset)
     scans = as_scans(data, normals, stripe, view)
     runtime.ensure_started()
     trace = trace if trace is not None else Trace()
@@ -122,7 +121,11 @@ def clean(scans: Scans, params: Params) -> tuple[Arranged, Measurement, Params]:
     """Measure the spacing, mark outliers and leave them out."""
     arranged = arrange(scans)
     if arranged.run is None or arranged.start is None:
-        return arranged, Measurement(spacing_along=0, spacing_across=0, noise=0, normal_noise=0), params
+        return (
+            arranged,
+            Measurement(spacing_along=0, spacing_across=0, noise=0, normal_noise=0),
+            params,
+        )
     along, across = stripe_spacing(arranged.points, arranged.start, arranged.run, arranged.view)
     measured = Measurement(
         spacing_along=along or across, spacing_across=across or along, noise=0.0, normal_noise=0.0
@@ -179,9 +182,7 @@ def estimate_normals(
     return estimated, measured
 
 
-def register(
-    scans: Scans, arranged: Arranged, normal: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def register(scans: Scans, arranged: Arranged, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return points and normals in the world."""
     if scans.frame == "world" or scans.T_world_view is None:
         return arranged.points, normal
@@ -232,7 +233,9 @@ def find_edges(grid: Grid, params: Params) -> tuple[np.ndarray, np.ndarray]:
     if params.edges.rule == "reason":
         return leaves, edges_by_reason(node[leaves, STOP])
     if params.edges.rule == "levels":
-        return leaves, edges_by_level(level, params.edges.smallest_levels, params.edges.fillet_levels)
+        return leaves, edges_by_level(
+            level, params.edges.smallest_levels, params.edges.fillet_levels
+        )
     assert params.grid.tolerance is not None
     size = grid.size / 2.0**level
     return leaves, edges_by_radius(size, params.grid.tolerance, params.edges.radius)
@@ -241,11 +244,11 @@ def find_edges(grid: Grid, params: Params) -> tuple[np.ndarray, np.ndarray]:
 def grow_regions(
     grid: Grid, leaves: np.ndarray, edge: np.ndarray, measured: Measurement, params: Params
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the label of every node, -1 for edge cells and small groups, and of every sorted point."""
+    """Return the label of every node and of every sorted point, -1 where there is no patch."""
     assert params.regions.homogeneity is not None and params.regions.min_points is not None
     assert params.grid.edge_tolerance is not None
     literal = params.edges.rule == "levels"
-    rule = {
+    rule: dict[str, Any] = {
         "homogeneity": params.regions.homogeneity,
         "chord": float("inf") if literal else _CHORD * params.grid.edge_tolerance,
         "slack": 3.0 * measured.noise,
@@ -270,7 +273,7 @@ def grow_regions(
     )
     bend = (group < 0) & (whole >= 0)
     finest = grid.size / 2.0**grid.depth
-    fit = {
+    fit: dict[str, Any] = {
         "limit": _JOIN_CELLS * finest + 3.0 * measured.noise,
         "tight": _LIE_CELLS * finest + 3.0 * measured.noise,
         "angle": _BEND_TOLERANCES * params.grid.edge_tolerance,
@@ -340,7 +343,8 @@ def assemble(
         points[left_out] = scans_in_world(scans, left_out)
     mean = runtime.download(grid.mean)[leaves]
     cells = Cells(
-        corner=grid.corner + node[leaves, X : Z + 1] * (grid.size / 2.0 ** node[leaves, LEVEL])[:, None],
+        corner=grid.corner
+        + node[leaves, X : Z + 1] * (grid.size / 2.0 ** node[leaves, LEVEL])[:, None],
         size=grid.size / 2.0 ** node[leaves, LEVEL],
         level=node[leaves, LEVEL].astype(np.int8),
         count=node[leaves, HI] - node[leaves, LO],

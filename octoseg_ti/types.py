@@ -193,9 +193,10 @@ class Segmentation:
     """Surface of every patch, shape (K,), i32: patches of one surface share a number."""
     parameters: np.ndarray
     """Surface parameters of every patch, shape (K, 8), f64: point (3), axis or normal (3), a, b;
-    a = radius (cylinder, sphere, torus ring), half angle (cone); b = tube radius (torus). NaN = none."""
+    a = radius (cylinder, sphere, torus ring), half angle (cone); b = tube radius (torus). NaN where
+    there is none."""
     residual: np.ndarray
-    """Root mean square distance of the points to the fitted surface [mm], shape (K,); NaN = none."""
+    """Root mean square distance of the points to the surface [mm], shape (K,); NaN = none."""
     cells: Cells
     """The final grid."""
     stripe: np.ndarray | None = None

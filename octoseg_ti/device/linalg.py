@@ -32,8 +32,9 @@ def _rotation(diagonal_p: ti.f64, diagonal_q: ti.f64, off: ti.f64) -> vec3:
 def symmetric_eigen(xx: ti.f64, xy: ti.f64, xz: ti.f64, yy: ti.f64, yz: ti.f64, zz: ti.f64):
     """Return (eigenvalues ascending, their eigenvectors u, v, w) of a symmetric matrix.
 
-    Cyclic Jacobi rotations: slower than a closed formula and exact to rounding also for nearly equal
-    eigenvalues, where the formula fails (flat and isotropic neighbourhoods are exactly that case).
+    Cyclic Jacobi rotations: slower than a closed formula and exact to rounding also for nearly
+    equal eigenvalues, where the formula fails (flat and isotropic neighbourhoods are exactly that
+    case).
     """
     a = vec3(xx, yy, zz)
     b = vec3(xy, xz, yz)

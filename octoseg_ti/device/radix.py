@@ -30,7 +30,7 @@ def _sort_by_digit(
     key_out: I64Array,
     index_out: I32Array,
 ):
-    """Sort by one digit: count it in every chunk, scan the counts, move every element to its place."""
+    """Sort by one digit: count it in every chunk, scan the counts, move the elements."""
     chunk = (n + workers - 1) // workers
     for u in range(workers * stride):
         if u % stride == 0:
@@ -89,9 +89,7 @@ def sort_pairs(key: Any, index: Any, bits: int) -> tuple[Any, Any]:
     other_key, other_index = runtime.empty(n, np.int64), runtime.empty(n, np.int32)
     for p in range(passes):
         shift, radix = p * digit_bits, 1 << digit_bits
-        _sort_by_digit(
-            n, workers, stride, shift, radix, key, index, count, other_key, other_index
-        )
+        _sort_by_digit(n, workers, stride, shift, radix, key, index, count, other_key, other_index)
         key, other_key = other_key, key
         index, other_index = other_index, index
     return key, index

@@ -16,9 +16,9 @@ import numpy as np
 import platformdirs
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-import taichi as ti  # noqa: E402
+import taichi as ti
 
-from octoseg_ti.device import tracing  # noqa: E402
+from octoseg_ti.device import tracing
 
 tracing.speed_up(ti.lang.kernel_impl, ti.lang.ast.ast_transformer_utils)
 
@@ -56,7 +56,9 @@ _started: Options | None = None
 
 def cache_folder() -> Path:
     """Return the folder of compiled kernels; the environment variable OCTOSEG_CACHE moves it."""
-    base = os.environ.get("OCTOSEG_CACHE") or platformdirs.user_cache_dir("octoseg", appauthor=False)
+    base = os.environ.get("OCTOSEG_CACHE") or platformdirs.user_cache_dir(
+        "octoseg", appauthor=False
+    )
     return Path(base) / f"taichi-{'.'.join(map(str, ti.__version__))}"
 
 
@@ -108,7 +110,9 @@ def start(
                 random_seed=0,
             )
     except RuntimeError as error:
-        raise RuntimeError(f"arch {arch!r} is not available on this machine: use --arch cpu") from error
+        raise RuntimeError(
+            f"arch {arch!r} is not available on this machine: use --arch cpu"
+        ) from error
     finally:
         if overruled is not None:
             os.environ["TI_ARCH"] = overruled
@@ -145,7 +149,7 @@ def workers() -> tuple[int, int]:
 
 
 def upload(array: np.ndarray) -> Any:
-    """Return the array as a kernel argument: itself on the CPU, a copy in device memory elsewhere."""
+    """Return the array as a kernel argument: itself on the CPU, else a copy on the device."""
     array = np.ascontiguousarray(array)
     if on_cpu() or array.size == 0:
         return array

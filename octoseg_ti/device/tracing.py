@@ -3,9 +3,10 @@
 Taichi 1.7 translates every kernel anew in every process, also when the compiled code comes from the
 cache, and two thirds of that time goes into text: for each node of the syntax tree it renders an
 excerpt of the source, wrapped and underlined, in case an error has to be reported, and it reads and
-wraps the source of a function again at each of its calls. Here the position is one line, and sources
-are read once. For each decorated function it also searches all modules to learn whether it stands in a
-class; ours never do. Names of Taichi that are not there (another version) leave everything as it was.
+wraps the source of a function again at each of its calls. Here the position is one line, and
+sources are read once. For each decorated function it also searches all modules to learn whether it
+stands in a class; ours never do. Names of Taichi that are not there (another version) leave
+everything as it was.
 """
 
 import functools
@@ -30,7 +31,7 @@ def speed_up(kernel_impl: Any, transformer: Any) -> None:
         kernel_impl: The module ``taichi.lang.kernel_impl``.
         transformer: The module ``taichi.lang.ast.ast_transformer_utils``.
     """
-    context = getattr(transformer, "ASTTransformerContext", None)
+    context: Any = getattr(transformer, "ASTTransformerContext", None)
     if hasattr(context, "get_pos_info"):
         context.get_pos_info = _position
     for name in ("getsourcelines", "getsourcefile"):

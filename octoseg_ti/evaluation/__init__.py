@@ -45,10 +45,10 @@ def evaluate(
     """Score a segmentation against the truth.
 
     Points whose true patch is unknown (-1) are left out of the scores of regions; regions that lie
-    mostly on such points are counted as ``on_unknown``, not as noise. Every score comes twice: over all points,
-    and over the interior points. Interior points are those farther than ``edge_distance`` from the
-    nearest true edge; if the truth does not know its edges, those that the result did not call
-    edge points.
+    mostly on such points are counted as ``on_unknown``, not as noise. Every score comes twice: over
+    all points, and over the interior points. Interior points are those farther than
+    ``edge_distance`` from the nearest true edge; if the truth does not know its edges, those that
+    the result did not call edge points.
 
     Args:
         result: A `Segmentation`, or anything with ``labels`` (and, where they are to be scored,

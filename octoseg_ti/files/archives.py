@@ -22,7 +22,7 @@ _NOISE = 0.95  # deflate would save less than this leaves
 
 
 def pack(arrays: Mapping[str, Any]) -> bytes:
-    """Return the bytes of an NPZ file with fixed time stamps, so that equal arrays give equal bytes.
+    """Return the bytes of an NPZ file with fixed time stamps: equal arrays give equal bytes.
 
     Arrays that a sample shows to be noise are stored, the others deflated at the lowest level: many
     times faster than the default of NumPy, and hardly larger.
@@ -84,8 +84,8 @@ def pack_truth(truth: Truth, points: np.ndarray) -> bytes:
     """Return ``ground_truth.npz``: every array of the truth in point order, without loss.
 
     ``patch``, ``surface``, ``kind``, ``edge_distance``, ``edge_class`` are stored as they are;
-    ``position_byte0`` to 7 and ``normal_byte0`` to 7, each (N, 3) u8, hold the bytes of the f64 rows,
-    lowest first, the positions XOR those of ``points``. This halves the file.
+    ``position_byte0`` to 7 and ``normal_byte0`` to 7, each (N, 3) u8, hold the bytes of the f64
+    rows, lowest first, the positions XOR those of ``points``. This halves the file.
 
     Args:
         truth: The truth.
@@ -119,8 +119,8 @@ def result_arrays(result: Segmentation, *, per_point: bool) -> dict[str, Any]:
 
     Args:
         result: The segmentation.
-        per_point: With the arrays that have a row per point, as the NPZ output has them; a recording
-            keeps these in its topics.
+        per_point: With the arrays that have a row per point, as the NPZ output has them; a
+            recording keeps these in its topics.
     """
     arrays: dict[str, Any] = {}
     if per_point:

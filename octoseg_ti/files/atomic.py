@@ -42,7 +42,7 @@ class AtomicFile:
             if not os.access(self._target, os.W_OK):
                 raise DataError("cannot write: the file is read-only", path=path, hint=_HINT)
         try:
-            self.file: IO[bytes] = open(self.part, "wb")  # noqa: SIM115 (closed by commit and abort)
+            self.file: IO[bytes] = open(self.part, "wb")
         except OSError as error:
             raise cannot_write(self.path, error) from error
 

@@ -67,7 +67,8 @@ def rows(columns: dict[str, np.ndarray]) -> np.ndarray:
 def scan_values(data: Any, names: set[str], scale: float) -> dict[str, Any]:
     """Return the fields of `Scans` from a table with named columns.
 
-    A table with labels is a result of ours: its normals are not taken over, they are estimated anew.
+    A table with labels is a result of ours: its normals are not taken over, they are estimated
+    anew.
 
     Args:
         data: Anything that gives a column for ``data[name]``.

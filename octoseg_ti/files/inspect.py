@@ -23,10 +23,10 @@ def describe(path: str | Path) -> dict[str, Any]:
         path: Any file that `read` takes.
 
     Returns:
-        ``path``, ``format``, ``bytes``; for a recording also ``library``, ``topics`` (topic, schema,
-        encoding, messages), ``duration_s``, ``frames``, ``metadata``, ``attachments``; for an NPZ
-        file ``arrays`` (shape and dtype); and what its scans are: ``points``, ``stripes``, ``views``,
-        ``finite``, ``box_mm``, ``normals``, ``truth_patches``, ``patches``.
+        ``path``, ``format``, ``bytes``; for a recording also ``library``, ``topics`` (topic,
+        schema, encoding, messages), ``duration_s``, ``frames``, ``metadata``, ``attachments``; for
+        an NPZ file ``arrays`` (shape and dtype); and what its scans are: ``points``, ``stripes``,
+        ``views``, ``finite``, ``box_mm``, ``normals``, ``truth_patches``, ``patches``.
 
     Raises:
         DataError: Missing, damaged or unknown.

@@ -1,8 +1,8 @@
 """LZF, the compression inside PCD files: decoding only.
 
 The one package on offer is a C extension without wheels, which would make every installation need a
-compiler. Format: M. Lehmann's LibLZF. A control byte c < 32 copies c + 1 bytes; otherwise c >> 5 (7:
-plus the next byte) + 2 bytes repeat from ((c & 31) << 8 | next byte) + 1 bytes back.
+compiler. Format: M. Lehmann's LibLZF. A control byte c < 32 copies c + 1 bytes; otherwise c >> 5
+(7: plus the next byte) + 2 bytes repeat from ((c & 31) << 8 | next byte) + 1 bytes back.
 """
 
 from __future__ import annotations

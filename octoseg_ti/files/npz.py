@@ -1,7 +1,7 @@
 """Scans, truth and results as NPZ: the plain exchange format, without loss.
 
-A file of ours has the array ``octoseg``: "scans" or "segmentation". In a file without it, ``labels``
-are truth (a labelled data set); in a segmentation they are the result.
+A file of ours has the array ``octoseg``: "scans" or "segmentation". In a file without it,
+``labels`` are truth (a labelled data set); in a segmentation they are the result.
 """
 
 from __future__ import annotations

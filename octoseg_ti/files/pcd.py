@@ -54,7 +54,8 @@ def write(
 ) -> None:
     """Write binary PCD with the columns of the PLY output.
 
-    Colours are packed into one field ``rgb``, as the format has it; normals are named normal_x to z.
+    Colours are packed into one field ``rgb``, as the format has it; normals are named normal_x to
+    z.
 
     Raises:
         DataError: The output cannot be written.

@@ -108,7 +108,7 @@ class _Header:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[IO[bytes]]:
-    """Give the file, unpacked into a nameless one when it is compressed: plyfile maps real files."""
+    """Give the file, unpacked into a nameless one if compressed: plyfile maps real files."""
     if path.suffix.lower() != ".gz":
         with open(path, "rb") as stream:
             yield stream

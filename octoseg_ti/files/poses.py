@@ -8,8 +8,9 @@ import numpy as np
 def quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
     """Return (x, y, z, w) of a rotation matrix (3, 3), with w >= 0.
 
-    The component of largest magnitude is taken from the diagonal, so that no angle is ill-conditioned
-    (S. W. Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1(3), 1978).
+    The component of largest magnitude is taken from the diagonal, so that no angle is ill-
+    conditioned (S. W. Shepperd, "Quaternion from rotation matrix", J. Guidance and Control 1(3),
+    1978).
     """
     r = np.asarray(rotation, np.float64)
     diagonal = np.array([r[0, 0], r[1, 1], r[2, 2], r[0, 0] + r[1, 1] + r[2, 2]])

@@ -88,8 +88,9 @@ def read_scans(path: str | Path, *, topic: str | None = None) -> Scans:
     """Read the scan lines of a recording.
 
     A recording of ours comes back as it was: float32 metres as written, times, columns, views,
-    poses; one that holds a result only gives the points, stripes and views of the result. In a foreign one every message of the topic is a stripe (one message alone is an
-    unorganised cloud); messages in a frame with a known transform are moved to its root frame.
+    poses; one that holds a result only gives the points, stripes and views of the result. In a
+    foreign one every message of the topic is a stripe (one message alone is an unorganised cloud);
+    messages in a frame with a known transform are moved to its root frame.
 
     Args:
         path: The recording.

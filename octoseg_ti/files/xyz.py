@@ -21,9 +21,9 @@ _HEAD_LINES = 100
 def read_scans(path: str | Path, *, unit: str | None = None) -> Scans:
     """Read points, and unit normals where columns four to six hold them.
 
-    Lines before the first row of numbers are a header; if the last of it names the columns (x, y, z,
-    ...), they are taken by name. Otherwise the first three columns are the position, and the next
-    three are normals if they have unit length in every row; further columns are not used.
+    Lines before the first row of numbers are a header; if the last of it names the columns (x, y,
+    z, ...), they are taken by name. Otherwise the first three columns are the position, and the
+    next three are normals if they have unit length in every row; further columns are not used.
 
     Args:
         path: The text file.

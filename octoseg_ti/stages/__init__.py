@@ -1,1 +1,1 @@
-"""The method, one stage a file, in the order of the paper; no stage imports another but the grid."""
+"""The method, one stage a file; no stage imports another but the grid."""

@@ -1,8 +1,9 @@
 """Which cells of the sparse grid touch: found once, used by every stage that walks over the cells.
 
 Two cells touch when their closed boxes share a corner, an edge or a face, whatever their sizes.
-Nodes are numbered level by level, so a smaller number is a coarser cell or one of the same size: the
-finer (or later) cell of a pair finds the other by looking up the 26 boxes of its own size around it.
+Nodes are numbered level by level, so a smaller number is a coarser cell or one of the same size:
+the finer (or later) cell of a pair finds the other by looking up the 26 boxes of its own size
+around it.
 """
 
 from dataclasses import dataclass

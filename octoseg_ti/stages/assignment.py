@@ -202,14 +202,17 @@ def assign_points(
     Args:
         grid: The sparse grid.
         leaves: The nodes that are leaves, in Morton order, shape (C,).
-        cell_label: Label of every node, -1 for edge cells and for those of no patch, shape (M,), i32.
-        bend: Nodes on a bend, shape (M,), bool. Their points join a patch when they lie on its plane,
-            or when they are near it and its normal agrees with that of their cell.
-        limit: Largest distance of a point from the mean plane of the cell whose patch it joins [mm].
+        cell_label: Label of every node, -1 for edge cells and for those of no patch, shape (M,),
+            i32.
+        bend: Nodes on a bend, shape (M,), bool. Their points join a patch when they lie on its
+            plane, or when they are near it and its normal agrees with that of their cell.
+        limit: Largest distance of a point from the mean plane of the cell whose patch it joins
+            [mm].
         tight: Largest distance from the plane on a bend where the normals do not agree [mm].
         only: Nodes whose points are looked at, shape (M,), bool; None = all.
         rounds: How many smallest cells away to look at most.
-        angle: Largest angle between the normals of a bend and of the cell whose patch it joins [rad].
+        angle: Largest angle between the normals of a bend and of the cell whose patch it joins
+            [rad].
 
     Returns:
         Label of every sorted point, -1 where no patch fits, shape (n,), i32.

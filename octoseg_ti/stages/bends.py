@@ -1,11 +1,11 @@
 """Regions that are several flat faces joined by bends are cut along the bends.
 
-A bend that is wider than the smallest cell leaves a chain of agreeing cells, through which the flood
-passes from face to face. The paper's remedy is to remove the smallest cells by hand until the faces
-come apart (section 3.4). Here the turning of the normals from cell to cell tells where a region
-bends: the cells that turn most are removed, and the cut is accepted when the turning is concentrated
-in what was removed: every face is flat compared with the angle to its nearest sister. A
-surface of even curvature never passes: removing any half of it leaves pieces that turn by t with
+A bend that is wider than the smallest cell leaves a chain of agreeing cells, through which the
+flood passes from face to face. The paper's remedy is to remove the smallest cells by hand until the
+faces come apart (section 3.4). Here the turning of the normals from cell to cell tells where a
+region bends: the cells that turn most are removed, and the cut is accepted when the turning is
+concentrated in what was removed: every face is flat compared with the angle to its nearest sister.
+A surface of even curvature never passes: removing any half of it leaves pieces that turn by t with
 gaps of t between them; such a piece has the deviation t / sqrt(12), and its sister stands at the
 angle 2 t: a ratio of 0.14.
 """
@@ -103,7 +103,7 @@ def _sum_turns(
     # Out:
     sum_inout: I64Rows,
 ):
-    """Add up, for every cell, squared turning and squared distance to the touching cells of its group."""
+    """Add up squared turning and squared distance to the touching cells of the same group."""
     for c in group_in:
         if group_in[c] >= 0:
             n = row(mean_in, c)
@@ -138,9 +138,7 @@ def _sum_turns(
             ti.atomic_add(sum_inout[c, 1], own_far)
 
 
-def turning(
-    grid: Grid, touching: Adjacency, group: np.ndarray, noise: float
-) -> np.ndarray:
+def turning(grid: Grid, touching: Adjacency, group: np.ndarray, noise: float) -> np.ndarray:
     """Return how far the normal turns over one smallest cell, around every cell of a group.
 
     Args:
@@ -300,6 +298,4 @@ def _suspects(
     doubtful = (size >= min_points) & (1.0 - np.linalg.eigvalsh(tensor)[:, 2] > flat**2)
     order = np.argsort(owner, kind="stable")
     first = np.searchsorted(owner[order], np.arange(len(names) + 1))
-    return {
-        int(names[g]): inside[order[first[g] : first[g + 1]]] for g in np.flatnonzero(doubtful)
-    }
+    return {int(names[g]): inside[order[first[g] : first[g + 1]]] for g in np.flatnonzero(doubtful)}

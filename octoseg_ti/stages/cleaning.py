@@ -10,7 +10,6 @@ from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, ti
 
 
-
 @ti.func
 def _square_to_segment(p: vec3, a: vec3, b: vec3) -> ti.f64:
     """Return the squared distance of a point from a segment."""

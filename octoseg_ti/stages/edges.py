@@ -8,7 +8,7 @@ from octoseg_ti.types import EdgeClass, StopReason
 
 
 def edges_by_reason(stop: np.ndarray) -> np.ndarray:
-    """Return the edge class of leaves by why they stopped: every rough cell that could not be split.
+    """Return the edge class of leaves by why they stopped: rough cells that could not split.
 
     Args:
         stop: `StopReason` of every leaf, shape (C,).

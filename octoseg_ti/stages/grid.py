@@ -35,7 +35,7 @@ _FEW_POINTS = int(StopReason.FEW_POINTS)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Grid:
-    """The cells of all levels, level after level, and the points in Morton order (kernel arrays)."""
+    """The cells, level after level, and the points in Morton order (kernel arrays)."""
 
     corner: np.ndarray
     """Lower corner of the box of the cells [mm], shape (3,)."""
@@ -67,15 +67,26 @@ class Grid:
 
 @ti.func
 def find_node(
-    x: ti.i32, y: ti.i32, z: ti.i32, level: ti.i32, shape: ti.template(), depth: ti.i32,
-    root: ti.template(), child: ti.template(),
+    x: ti.i32,
+    y: ti.i32,
+    z: ti.i32,
+    level: ti.i32,
+    shape: ti.template(),
+    depth: ti.i32,
+    root: ti.template(),
+    child: ti.template(),
 ) -> ti.i32:
-    """Return the node that covers the box (x, y, z) of a level: that box or a coarser leaf; -1 = none."""
+    """Return the node of a box of a level: the box itself or a coarser leaf; -1 = none."""
     bx, by, bz = x >> level, y >> level, z >> level
     found = -1
     if (
-        x >= 0 and y >= 0 and z >= 0 and level <= depth
-        and bx < shape[0] and by < shape[1] and bz < shape[2]
+        x >= 0
+        and y >= 0
+        and z >= 0
+        and level <= depth
+        and bx < shape[0]
+        and by < shape[1]
+        and bz < shape[2]
     ):
         found = root[(bx * shape[1] + by) * shape[2] + bz]
         down = level
@@ -105,7 +116,7 @@ def _gather(
     normal_out: F64Rows,
     head_out: I32Array,
 ):
-    """Bring the points into Morton order, and count those of every chunk that begin an initial cell."""
+    """Bring the points into Morton order, and count those that begin an initial cell."""
     for i in order_in:
         j = order_in[i]
         for k in ti.static(range(3)):
@@ -312,8 +323,9 @@ def build_grid(
         min_cell: Smallest cell [mm]; 0 = as small as a key can address.
         min_points: A cell with fewer points is not split.
         flatness: A cell is also split when its points deviate from its mean plane by more than
-            ``flatness`` times tolerance times cell size plus three times the noise; this finds steps
-            between parallel faces, which normals alone cannot show. Infinite = off (the paper).
+            ``flatness`` times tolerance times cell size plus three times the noise; this finds
+            steps between parallel faces, which normals alone cannot show. Infinite = off (the
+            paper).
         noise: Standard deviation of the range [mm].
         signed: Normals have a side; else axes are compared.
 
@@ -338,7 +350,10 @@ def build_grid(
     key, index = morton_keys(point, corner, scale, last)
     bits = 3 * ((max(shape) - 1).bit_length() + depth)
     key, order = radix.sort_pairs(key, index, max(1, bits))
-    sorted_point, sorted_normal = runtime.empty((n, 3), np.float64), runtime.empty((n, 3), np.float64)
+    sorted_point, sorted_normal = (
+        runtime.empty((n, 3), np.float64),
+        runtime.empty((n, 3), np.float64),
+    )
     workers, stride = runtime.workers()
     heads = runtime.empty(workers, np.int32)
     _gather(
@@ -379,9 +394,7 @@ def build_grid(
         if total > node.shape[0]:
             rows = 2 * total
             node, child, mean = (runtime.grown(a, rows) for a in (node, child, mean))
-        _emit_children(
-            first, count, level, daughters, runtime.upload(place), bound, node, child
-        )
+        _emit_children(first, count, level, daughters, runtime.upload(place), bound, node, child)
         passes += int(total > count)
         first, count, level = count, total, level + 1
     return Grid(

@@ -1,4 +1,4 @@
-"""What the data say about themselves: spacing along and across the stripes, noise of points and normals.
+"""What the data say about themselves: spacing of the points, noise of points and normals.
 
 The default parameters are derived from these figures, so they must not depend on the order of the
 views: every figure is a median or a trimmed mean over points chosen by their place in the stripe.
@@ -7,12 +7,12 @@ views: every figure is a median or a trimmed mean over points chosen by their pl
 import numpy as np
 
 from octoseg_ti.device import runtime
-from octoseg_ti.device.linalg import row, vec3
+from octoseg_ti.device.linalg import row
 from octoseg_ti.device.runtime import F32Array, F64Rows, I32Array, ti
 
 _SAMPLES = 25_000
-# Mean of the lower three quarters of |x| for x normal, and of a Rayleigh variable, both of unit scale.
-# Trimmed means instead of medians: coarse quantisation can make a median zero.
+# Mean of the lower three quarters of |x| for x normal, and of a Rayleigh variable, both of unit
+# scale. Trimmed means instead of medians: coarse quantisation can make a median zero.
 _TRIM = 0.75
 _HALF_NORMAL_TRIMMED = 0.5149
 _RAYLEIGH_TRIMMED = 0.9558
@@ -32,7 +32,7 @@ def _measure_spacing(
     along_out: F32Array,
     across_out: F32Array,
 ):
-    """Write the distance to the next point of the stripe, and to the nearest one of the next stripe."""
+    """Write the distance to the next point of the stripe, and to the next stripe."""
     for i in run_in:
         along_out[i] = -1.0
         across_out[i] = -1.0
@@ -108,7 +108,7 @@ def _step(n: int) -> int:
 
 
 def _trimmed_mean(values: np.ndarray) -> float:
-    """Return the mean of the lower three quarters of the non-negative values; 0 if there are none."""
+    """Return the mean of the lower three quarters of the non-negative values, or 0."""
     values = values[values >= 0]
     if len(values) == 0:
         return 0.0
@@ -158,8 +158,8 @@ def stripe_noise(
 ) -> tuple[float, float]:
     """Return the noise of the range [mm] and of the normals [rad], measured along the stripes.
 
-    Second differences remove position, slope and constant curvature; what remains is noise. The mean
-    of the lower three quarters ignores edges.
+    Second differences remove position, slope and constant curvature; what remains is noise. The
+    mean of the lower three quarters ignores edges.
 
     Args:
         points: Positions [mm], shape (N, 3), f64, in stripe order.

@@ -1,8 +1,8 @@
 """Moments of cells (Eqs 3 and 4): sums that tell mean, deviation and flatness without the points.
 
-A cell has 19 moments, in units of 2^-30: the count; sum N; sum N N'; sum p; sum p p', with p measured
-from the middle of the cell in half cell sizes. They are integers, so a sum depends neither on the
-order of the points nor on the threads.
+A cell has 19 moments, in units of 2^-30: the count; sum N; sum N N'; sum p; sum p p', with p
+measured from the middle of the cell in half cell sizes. They are integers, so a sum depends neither
+on the order of the points nor on the threads.
 """
 
 from typing import Any
@@ -29,7 +29,10 @@ NORMAL, POINT, SIGMA, RESIDUAL = 0, 3, 6, 7
 @ti.func
 def _fixed(x: ti.f64) -> ti.i64:
     """Return a value of -1..1 in fixed point."""
-    return ti.cast(x * _ONE, ti.i64)
+    half = 0.5
+    if x < 0.0:
+        half = -0.5
+    return ti.cast(x * _ONE + half, ti.i64)
 
 
 @ti.kernel

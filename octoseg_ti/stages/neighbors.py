@@ -113,10 +113,12 @@ def neighbor_normals(
     off = off[off >= 0]
     noise = 0.0
     if len(off):
-        # The lower three quarters: the others may lie on edges. A plane takes three degrees of freedom.
+        # The lower three quarters: the others may lie on edges. A plane takes three degrees of
+        # freedom.
         kept = off[: max(1, 3 * len(off) // 4)]
         noise = float(np.sqrt(np.mean(kept**2, dtype=np.float64) * count / max(1, count - 3)))
-    # Slope of a plane fitted in a disc of radius r: sigma / (r / 2) / sqrt(count), in two directions.
+    # Slope of a plane fitted in a disc of radius r: sigma / (r / 2) / sqrt(count), in two
+    # directions.
     tilt = 2.0 * np.sqrt(2.0 / count) * noise / float(np.median(radius))
     return runtime.download(normal), Measurement(
         spacing_along=spacing,

@@ -1,4 +1,4 @@
-"""Stage 2: point normals from the edge pairs of neighbouring stripes (section 3.2, Figs 4-6, Eqs 1-2).
+"""Stage 2: point normals from edge pairs of neighbouring stripes (section 3.2, Figs 4-6).
 
 Two stripes at a time: the march goes along both, and every step makes one triangle whose origin is
 on the second stripe. Triangles with an edge longer than the gap are left out, so that no phantom
@@ -12,7 +12,6 @@ from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, ti
 
 
-
 @ti.func
 def _add(sums: ti.template(), i: ti.i32, n: vec3):
     """Add to row ``i``; plain stores, because a strip shares its points with none of its colour."""
@@ -22,7 +21,7 @@ def _add(sums: ti.template(), i: ti.i32, n: vec3):
 
 @ti.func
 def _edge_pair(origin: vec3, first: vec3, second: vec3, gap: ti.f64, by_area: ti.i32) -> vec3:
-    """Return the normal of an edge pair, zero when an edge is too long or the pair is degenerate."""
+    """Return the normal of an edge pair; zero for a degenerate one or one that spans a gap."""
     e1 = first - origin
     e2 = second - origin
     n = vec3(0.0, 0.0, 0.0)
@@ -54,7 +53,7 @@ def _march(
     # Out:
     sum_inout: F64Rows,
 ):
-    """March along every second pair of stripes and add the normal of each edge pair to its points."""
+    """March along every second pair of stripes, adding each normal to its three points."""
     for u in range(pairs * stride):
         s = 2 * (u // stride) + colour
         if u % stride == 0 and view_in[start_in[s]] == view_in[start_in[s + 1]]:

@@ -1,4 +1,4 @@
-"""Which patches are planes: a plane through the points of every patch, and how far they are from it."""
+"""Which patches are planes: a plane through every patch, and how far its points are from it."""
 
 import numpy as np
 
@@ -58,8 +58,8 @@ def fit_planes(
 
     Returns:
         `SurfaceKind` PLANE or NONE, shape (K,), i8; parameters, shape (K, 8), f64: a point, the
-        normal (its side is not determined), NaN; and the root mean square distance [mm], shape (K,).
-        Parameters and distance are NaN where the patch is no plane.
+        normal (its side is not determined), NaN; and the root mean square distance [mm], shape
+        (K,). Parameters and distance are NaN where the patch is no plane.
     """
     runtime.ensure_started()
     kind = np.full(patches, int(SurfaceKind.NONE), np.int8)
