@@ -130,7 +130,7 @@ def test_too_few_points(n: int) -> None:
 def test_too_few_usable_points() -> None:
     points = POINTS.copy()
     points[2:] = np.nan
-    with pytest.raises(DataError, match="2 of 12 points can be used.*NaN"):
+    with pytest.raises(DataError, match=r"2 of 12 points can be used.*NaN"):
         arrange(as_scans(points))
 
 

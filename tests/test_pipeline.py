@@ -1,4 +1,4 @@
-"""What must hold for any input: the same labels again, in any order of views, points and threads."""
+"""What must hold for any input: the same labels, in any order of views, points and threads."""
 
 import hashlib
 import os
@@ -77,7 +77,7 @@ def test_the_answer_is_consistent(block, answer: Segmentation) -> None:
 
 
 def test_normals_point_to_the_probe_and_points_are_in_the_world(block, answer) -> None:
-    scans, truth = block
+    _, truth = block
     np.testing.assert_allclose(answer.points, truth.position, atol=0.2)
     has = answer.normals.any(axis=1)
     inside = has & (truth.edge_distance > 3.0)
@@ -297,7 +297,7 @@ def test_stages_are_timed_and_reported(tent) -> None:
 
 @pytest.mark.parametrize("share", [0.002, 0.01])
 def test_spikes_are_found_and_little_else(block, share: float) -> None:
-    scans, truth = block
+    scans, _ = block
     clean = segment(scans)
     rng = np.random.default_rng(8)
     n = len(scans)

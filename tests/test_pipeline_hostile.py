@@ -117,7 +117,7 @@ def test_meagre_stripes_get_an_answer_or_a_clear_line(kind: str, split: str) -> 
 
 def test_one_stripe_is_refused_with_advice(tent) -> None:
     first = tent[0].stripe == 0
-    with pytest.raises(DataError, match="one stripe.*unorganised"):
+    with pytest.raises(DataError, match=r"one stripe.*unorganised"):
         segment(tent[0].points[first], stripe=np.zeros(int(first.sum()), int))
 
 
@@ -165,7 +165,7 @@ def test_two_opposite_sheets_are_two_patches() -> None:
     """W8: a thin wall. Its sides share cells, and normals of opposite sense must not join."""
     x, y = (a.ravel() for a in np.mgrid[0:60, 0:60] * 0.5)
     sheet = np.column_stack((x, y, np.zeros_like(x)))
-    points = np.concatenate((sheet, sheet + [0, 0, 3.0]))
+    points = np.concatenate((sheet, sheet + np.array([0, 0, 3.0])))
     normals = np.repeat([[0.0, 0, -1], [0.0, 0, 1]], len(sheet), axis=0)
     result = segment(points, normals=normals)
     assert result.patch_count == 2

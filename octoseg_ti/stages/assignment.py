@@ -16,6 +16,17 @@ from octoseg_ti.types import NONE
 _ROUNDS = 3
 
 
+@ti.func
+def _better(best: ti.template(), k: ti.i32, off: ti.f64, far: ti.f64, label: ti.f64) -> ti.i32:
+    """Say whether a cell suits better: nearer plane, then nearer middle, then smaller label."""
+    better = off < best[k, 0]
+    if off == best[k, 0]:
+        better = far < best[k, 1]
+        if far == best[k, 1]:
+            better = label < best[k, 2]
+    return ti.cast(better, ti.i32)
+
+
 @ti.kernel
 def _join(
     reach: ti.i32,
@@ -63,22 +74,15 @@ def _join(
                 normal = row(mean_in, c)
                 middle = vec3(mean_in[c, POINT], mean_in[c, POINT + 1], mean_in[c, POINT + 2])
                 limit = rule[0]
-                if bend >= 0 and ti.abs(row(mean_in, bend).dot(normal)) < rule[2]:
-                    limit = rule[1]
+                if bend >= 0:  # nested: `and` would read the row of node -1
+                    if ti.abs(row(mean_in, bend).dot(normal)) < rule[2]:
+                        limit = rule[1]
                 for i in range(lo, hi):
                     k = run_in[u, 3] + i - lo
                     d = row(point_in, i) - middle
                     off = ti.abs(d.dot(normal))
                     far = d.norm_sqr()
-                    if off <= limit and (
-                        off < best_inout[k, 0]
-                        or (off == best_inout[k, 0] and far < best_inout[k, 1])
-                        or (
-                            off == best_inout[k, 0]
-                            and far == best_inout[k, 1]
-                            and label < best_inout[k, 2]
-                        )
-                    ):
+                    if off <= limit and _better(best_inout, k, off, far, label) == 1:
                         best_inout[k, 0] = off
                         best_inout[k, 1] = far
                         best_inout[k, 2] = label

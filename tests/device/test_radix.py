@@ -60,7 +60,7 @@ def test_special_orders(shape: str) -> None:
 @pytest.mark.parametrize("bits", [0, 64, -1])
 def test_wrong_bits_are_refused(bits: int) -> None:
     runtime.ensure_started()
-    with pytest.raises(ValueError, match="bits must be 1..63"):
+    with pytest.raises(ValueError, match=r"bits must be 1\.\.63"):
         radix.sort_pairs(np.zeros(3, np.int64), np.zeros(3, np.int32), bits)
 
 

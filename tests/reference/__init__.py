@@ -1,1 +1,1 @@
-"""Slow and obvious versions of the stages, in plain Python and NumPy, to hold the kernels against."""
+"""Slow and obvious versions of the stages, in plain Python, to hold the kernels against."""

@@ -70,13 +70,8 @@ def random_surface(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
     points[pipe] = (np.column_stack((u, 0 * u, 0 * u)) + 6.0 * round_)[pipe]
     normals[pipe] = round_[pipe]
     height = np.abs(v)
-    shell = np.column_stack(
-        (
-            np.sqrt(1 - height**2) * np.cos(2 * turn),
-            np.sqrt(1 - height**2) * np.sin(2 * turn),
-            height,
-        )
-    )
+    wide = np.sqrt(1 - height**2)
+    shell = np.column_stack((wide * np.cos(2 * turn), wide * np.sin(2 * turn), height))
     points[ball] = ([40.0, 0.0, 0.0] + 8.0 * shell)[ball]
     normals[ball] = shell[ball]
     return points, normals

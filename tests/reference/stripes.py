@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from statistics import NormalDist
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 
 def runs(start: np.ndarray) -> list[range]:
     """Return the rows of every stripe."""
-    return [range(int(a), int(b)) for a, b in zip(start[:-1], start[1:], strict=True)]
+    return [range(int(a), int(b)) for a, b in pairwise(start)]
 
 
 def to_segment(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
@@ -50,7 +51,7 @@ def stripe_spacing(points: np.ndarray, start: np.ndarray, view: np.ndarray) -> t
     along = [np.linalg.norm(points[i + 1] - points[i]) for s in stripes for i in s[:-1]]
     across = [
         np.linalg.norm(points[list(following)] - points[i], axis=1).min()
-        for stripe, following in zip(stripes[:-1], stripes[1:], strict=True)
+        for stripe, following in pairwise(stripes)
         if view[stripe[0]] == view[following[0]]
         for i in stripe
     ]
@@ -142,7 +143,7 @@ def edge_pair_normals(
     weight: str,
     origin: np.ndarray | None,
 ) -> np.ndarray:
-    """Return the mean of the normals of all edge pairs that use a point, on the side of the probe."""
+    """Return the mean normal of all edge pairs that use a point, on the side of the probe."""
     stripes = runs(start)
     axes = {}
     for v in set(view.tolist()):
@@ -150,7 +151,7 @@ def edge_pair_normals(
         length = np.linalg.norm(along)
         axes[v] = along / length if length > 0 else along
     total = np.zeros((len(points), 3))
-    for one, two in zip(stripes[:-1], stripes[1:], strict=True):
+    for one, two in pairwise(stripes):
         v = int(view[one[0]])
         if v != view[two[0]]:
             continue

@@ -22,7 +22,7 @@ def test_spacing_equals_the_reference(seed: int, stripes: int, length: int) -> N
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(("stripes", "length"), [(2, 3), (5, 20), (25, 80)])
 def test_noise_equals_the_reference(seed: int, stripes: int, length: int) -> None:
-    points, start, run, view = ragged_stripes(seed, stripes, length)
+    points, start, run, _ = ragged_stripes(seed, stripes, length)
     normals = unit(np.random.default_rng(seed).standard_normal(points.shape))
     normals[::7] = 0.0
     got = stripe_noise(points, normals, start, run, 0.8)
