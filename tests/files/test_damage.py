@@ -123,7 +123,7 @@ def test_missing_file_folder_and_unknown_suffix(tmp_path):
 
 
 def record(path, topics):
-    """Write a foreign recording of (topic, schema, encoding, messages), by the plain MCAP writer."""
+    """Write a foreign recording of (topic, schema, encoding, messages) by the plain writer."""
     from mcap.writer import Writer
     from mcap_protobuf.schema import build_file_descriptor_set
 

@@ -300,7 +300,7 @@ def test_pcd_forms(tmp_path, form):
 def test_lzf_known_answers(data, plain):
     assert decompress(data, len(plain)) == plain
     for broken in (data[:-1], data + b"\x00", b"\x20\xff" + data):
-        with pytest.raises(ValueError, match="bytes|data|reference|beginning"):
+        with pytest.raises(ValueError, match=r"bytes|data|reference|beginning"):
             decompress(broken, len(plain))
 
 
