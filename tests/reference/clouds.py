@@ -57,7 +57,7 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def random_surface(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and normals of a plane, a cylinder and a ball, without noise, shuffled."""
+    """Return points and normals of a plane, a cylinder and a ball, in random order."""
     rng = np.random.default_rng(seed)
     kind = rng.integers(0, 3, n)
     u, v = rng.uniform(0, 30, n), rng.uniform(-1, 1, n)

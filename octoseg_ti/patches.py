@@ -1,0 +1,169 @@
+"""From cells to the answer: regions grown and judged, points handed out, all in the input order."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from octoseg_ti.arrange import Arranged
+from octoseg_ti.defaults import spacing_of
+from octoseg_ti.device import runtime
+from octoseg_ti.params import Params
+from octoseg_ti.stages.adjacency import find_touching
+from octoseg_ti.stages.assignment import (
+    assign_points,
+    claimed_share,
+    points_of_leaves,
+    to_rows,
+)
+from octoseg_ti.stages.bends import split_at_bends
+from octoseg_ti.stages.grid import Grid
+from octoseg_ti.stages.moments import HI, LEVEL, LO, NORMAL, SIGMA, STOP, X, Z
+from octoseg_ti.stages.planes import fit_planes
+from octoseg_ti.stages.regions import flood_fill, number_groups, strips
+from octoseg_ti.types import NONE, Cells, EdgeClass, Measurement, Scans, Segmentation
+
+# The line through two cells may leave the surface by half a tolerance.
+_CHORD = 0.5
+# An edge point joins a patch whose plane is this near: in smallest cells, plus three noises.
+_JOIN_CELLS = 0.25
+# A group is no patch when larger ones explain this share of its points.
+_CLAIMED = 0.5
+# A point of a bend lies on a plane when it is this near.
+_LIE_CELLS = 0.05
+# A cell on a bend joins a face whose normal is this many tolerances away at most.
+_BEND_TOLERANCES = 2.0
+
+
+def grow_regions(
+    grid: Grid, leaves: np.ndarray, edge: np.ndarray, measured: Measurement, params: Params
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the label of every node and of every sorted point, -1 where there is no patch."""
+    assert params.regions.homogeneity is not None and params.regions.min_points is not None
+    assert params.grid.edge_tolerance is not None
+    literal = params.edges.rule == "levels"
+    rule: dict[str, Any] = {
+        "homogeneity": params.regions.homogeneity,
+        "chord": float("inf") if literal else _CHORD * params.grid.edge_tolerance,
+        "slack": 3.0 * measured.noise,
+    }
+    takes_part = np.zeros(grid.count, bool)
+    takes_part[leaves[edge == int(EdgeClass.NONE)]] = True
+    touching = find_touching(grid)
+    group = flood_fill(grid, touching, takes_part, **rule)
+    min_points = params.regions.min_points
+    if literal or not params.regions.assign_edges:
+        cell_label = number_groups(grid, group, min_points)
+        return cell_label, points_of_leaves(grid, leaves, cell_label[leaves])
+    whole = group
+    group = split_at_bends(
+        grid,
+        touching,
+        whole,
+        min_points=min_points,
+        flat=params.grid.edge_tolerance,
+        noise=measured.normal_noise,
+        **rule,
+    )
+    bend = (group < 0) & (whole >= 0)
+    finest = grid.size / 2.0**grid.depth
+    fit: dict[str, Any] = {
+        "limit": _JOIN_CELLS * finest + 3.0 * measured.noise,
+        "tight": _LIE_CELLS * finest + 3.0 * measured.noise,
+        "angle": _BEND_TOLERANCES * params.grid.edge_tolerance,
+    }
+    # Groups that larger ones explain are no patches: strips along an edge, and bends that are as
+    # flat as the face beside them. What is left of them stands for itself.
+    group[bend] = flood_fill(grid, touching, bend, **rule)[bend]
+    number = number_groups(grid, group, min_points)
+    doubtful = (strips(grid, touching, group) | bend) & (number >= 0)
+    cell_label = np.where(doubtful, NONE, number)
+    if doubtful.any():
+        judged = assign_points(
+            grid, leaves, cell_label, bend=bend, only=doubtful | bend, rounds=1, **fit
+        )
+        asked = np.flatnonzero(doubtful)
+        claimed = claimed_share(grid, leaves, judged, np.where(doubtful, number, NONE))
+        group[asked[claimed[number[asked]] > _CLAIMED]] = NONE
+        bends = np.flatnonzero(bend & (group >= 0))
+        cells = np.full(grid.count, NONE, np.int32)
+        cells[bends] = np.arange(len(bends), dtype=np.int32)
+        flush = bends[claimed_share(grid, leaves, judged, cells) > _CLAIMED]
+        group[flush] = NONE
+        cell_label = number_groups(grid, group, min_points)
+    label = assign_points(grid, leaves, cell_label, bend=bend, **fit)
+    return cell_label, label
+
+
+def assemble(
+    scans: Scans,
+    arranged: Arranged,
+    point: np.ndarray,
+    normal: np.ndarray,
+    grid: Grid,
+    leaves: np.ndarray,
+    edge: np.ndarray,
+    cell_label: np.ndarray,
+    label: np.ndarray,
+    measured: Measurement,
+    params: Params,
+) -> Segmentation:
+    """Number the patches by size, find the planes, and bring all into the input order."""
+    node = runtime.download(grid.node)[: grid.count]
+    patches = int(cell_label.max(initial=NONE)) + 1
+    size = np.bincount(label[label >= 0], minlength=patches)
+    rank = np.argsort(-size, kind="stable")
+    name = np.full(patches + 1, NONE, np.int32)
+    name[rank] = np.arange(patches, dtype=np.int32)
+    label, cell_label = name[label], name[cell_label]
+    core = points_of_leaves(grid, leaves, cell_label[leaves])
+    flat = 2.0 * measured.noise + 0.02 * spacing_of(measured)
+    kind, parameters, residual = fit_planes(grid, core, patches, limit=flat)
+
+    n = len(scans)
+    labels, levels, edges = to_rows(
+        grid, leaves, edge, label, None if arranged.whole else arranged.row, n
+    )
+    outlier = np.zeros(n, np.uint8)
+    if not arranged.whole:
+        outlier[:] = 1
+        outlier[arranged.row] = 0
+    if arranged.whole:
+        normals = normal.astype(np.float32)
+        points = point.copy() if np.shares_memory(point, scans.points) else point
+    else:
+        normals, points = np.zeros((n, 3), np.float32), np.full((n, 3), np.nan)
+        normals[arranged.row], points[arranged.row] = normal, point
+        left_out = np.flatnonzero(outlier)
+        points[left_out] = scans_in_world(scans, left_out)
+    mean = runtime.download(grid.mean)[leaves]
+    cells = Cells(
+        corner=grid.corner
+        + node[leaves, X : Z + 1] * (grid.size / 2.0 ** node[leaves, LEVEL])[:, None],
+        size=grid.size / 2.0 ** node[leaves, LEVEL],
+        level=node[leaves, LEVEL].astype(np.int8),
+        count=node[leaves, HI] - node[leaves, LO],
+        normal=mean[:, NORMAL : NORMAL + 3].astype(np.float32),
+        sigma=mean[:, SIGMA].astype(np.float32),
+        stop=node[leaves, STOP].astype(np.uint8),
+        edge=edge,
+        label=cell_label[leaves],
+        initial_size=grid.size,
+    )
+    return Segmentation(
+        points=points, normals=normals, labels=labels, edge=edges, level=levels, outlier=outlier,
+        kind=kind, surface=np.arange(patches, dtype=np.int32), parameters=parameters,
+        residual=residual, cells=cells, stripe=scans.stripe, view=scans.view, params=params,
+        measured=measured, passes=grid.passes, name=scans.name,
+    )  # fmt: skip
+
+
+def scans_in_world(scans: Scans, rows: np.ndarray) -> np.ndarray:
+    """Return the world positions of some rows [mm], shape (len(rows), 3)."""
+    points = scans.points[rows]
+    if scans.frame == "world" or scans.T_world_view is None:
+        return points
+    view = np.zeros(len(rows), np.int32) if scans.view is None else scans.view[rows]
+    pose = scans.T_world_view[view]
+    return np.einsum("nij,nj->ni", pose[:, :3, :3], points) + pose[:, :3, 3]
