@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import pytest
-from brute_force import solid
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.rays import solid
 
 from octoseg_ti.errors import DataError
 from scanner_sim.part import (

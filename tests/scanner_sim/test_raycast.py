@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from brute_force import first_hit, leaves, solid
+from reference.rays import first_hit, leaves, solid
 
 from octoseg_ti.types import SurfaceKind
 from scanner_sim.part import (

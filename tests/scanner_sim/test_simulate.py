@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 import pytest
-from brute_force import first_hit
+from reference.rays import first_hit
 
 from octoseg_ti.errors import DataError
 from octoseg_ti.types import EdgeClass, Scans, SurfaceKind, Truth
