@@ -38,8 +38,21 @@ _BEND_TOLERANCES = 2.0
 
 def grow_regions(
     grid: Grid, leaves: np.ndarray, edge: np.ndarray, measured: Measurement, params: Params
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the label of every node and of every sorted point, -1 where there is no patch."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Grow regions over the leaves, judge them, and hand out the points.
+
+    Args:
+        grid: The sparse grid.
+        leaves: The nodes that are leaves, in Morton order, shape (C,).
+        edge: `EdgeClass` of every leaf, shape (C,), u8.
+        measured: Spacing and noise.
+        params: Parameters, all filled in.
+
+    Returns:
+        The edge class of every leaf, with the strips along edges (sharp) and the bends (fillet)
+        that were found on the way; the label of every node, and that of every sorted point, -1
+        where there is no patch.
+    """
     assert params.regions.homogeneity is not None and params.regions.min_points is not None
     assert params.grid.edge_tolerance is not None
     literal = params.edges.rule == "levels"
@@ -55,7 +68,7 @@ def grow_regions(
     min_points = params.regions.min_points
     if literal or not params.regions.assign_edges:
         cell_label = number_groups(grid, group, min_points)
-        return cell_label, points_of_leaves(grid, leaves, cell_label[leaves])
+        return edge, cell_label, points_of_leaves(grid, leaves, cell_label[leaves])
     whole = group
     group = split_at_bends(
         grid,
@@ -85,15 +98,20 @@ def grow_regions(
         )
         asked = np.flatnonzero(doubtful)
         claimed = claimed_share(grid, leaves, judged, np.where(doubtful, number, NONE))
-        group[asked[claimed[number[asked]] > _CLAIMED]] = NONE
+        explained = asked[claimed[number[asked]] > _CLAIMED]
+        group[explained] = NONE
         bends = np.flatnonzero(bend & (group >= 0))
         cells = np.full(grid.count, NONE, np.int32)
         cells[bends] = np.arange(len(bends), dtype=np.int32)
         flush = bends[claimed_share(grid, leaves, judged, cells) > _CLAIMED]
         group[flush] = NONE
+        found = np.zeros(grid.count, np.uint8)
+        found[bend & (group >= 0)] = int(EdgeClass.FILLET)
+        found[explained] = int(EdgeClass.SHARP)
+        edge = np.where(edge == int(EdgeClass.NONE), found[leaves], edge)
         cell_label = number_groups(grid, group, min_points)
     label = assign_points(grid, leaves, cell_label, bend=bend, **fit)
-    return cell_label, label
+    return edge, cell_label, label
 
 
 def assemble(

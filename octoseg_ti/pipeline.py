@@ -89,7 +89,7 @@ def segment(
     with stage("edges"):
         leaves, edge = find_edges(grid, params)
     with stage("regions"):
-        cell_label, label = grow_regions(grid, leaves, edge, measured, params)
+        edge, cell_label, label = grow_regions(grid, leaves, edge, measured, params)
     with stage("patches"):
         result = assemble(
             scans, arranged, point, normal, grid, leaves, edge, cell_label, label, measured, params
