@@ -120,7 +120,8 @@ def arrange(scans: Scans, drop: np.ndarray | None = None) -> Arranged:
         finite = None if rows is None else np.isfinite(rows)
         if finite is not None and not finite.all():
             usable &= finite.all(axis=1)
-    row = np.arange(len(usable)) if usable.all() else np.flatnonzero(usable)
+    whole = bool(usable.all())
+    row = np.arange(len(usable)) if whole else np.flatnonzero(usable)
     if len(row) < 3:
         raise DataError(
             f"{len(row)} of {len(usable)} points can be used, a segmentation needs at least 3",
@@ -128,15 +129,20 @@ def arrange(scans: Scans, drop: np.ndarray | None = None) -> Arranged:
         )
     view = np.zeros(len(row), np.int32) if scans.view is None else scans.view[row]
     if scans.stripe is None:
-        return _arranged(scans, row, view, None, None)
-    stripe = scans.stripe[row]
-    later = (view[1:] > view[:-1]) | ((view[1:] == view[:-1]) & (stripe[1:] >= stripe[:-1]))
+        return _arranged(scans, row, view, None, None, whole)
+    stripe = scans.stripe if whole else scans.stripe[row]
+    later = stripe[1:] >= stripe[:-1]
+    if scans.view is not None:
+        later = (view[1:] > view[:-1]) | ((view[1:] == view[:-1]) & later)
     if not later.all():
+        whole = False
         order = np.lexsort((stripe, view))  # stable: the order along a stripe is kept
         row, view, stripe = row[order], view[order], stripe[order]
     new = np.empty(len(row), bool)
     new[0] = True
-    new[1:] = (stripe[1:] != stripe[:-1]) | (view[1:] != view[:-1])
+    new[1:] = stripe[1:] != stripe[:-1]
+    if scans.view is not None:
+        new[1:] |= view[1:] != view[:-1]
     first = np.flatnonzero(new)
     if len(first) < 2:
         raise DataError(
@@ -144,7 +150,7 @@ def arrange(scans: Scans, drop: np.ndarray | None = None) -> Arranged:
             hint="leave the stripe numbers out to treat the points as unorganised",
         )
     start = np.append(first, len(row)).astype(np.int32)
-    return _arranged(scans, row, view, np.cumsum(new, dtype=np.int32) - np.int32(1), start)
+    return _arranged(scans, row, view, np.cumsum(new, dtype=np.int32) - np.int32(1), start, whole)
 
 
 def _arranged(
@@ -153,9 +159,9 @@ def _arranged(
     view: np.ndarray,
     run: np.ndarray | None,
     start: np.ndarray | None,
+    whole: bool,
 ) -> Arranged:
     """Pick the rows of every array."""
-    whole = len(row) == len(scans.points) and (len(row) < 2 or bool(np.all(np.diff(row) == 1)))
     normals = scans.normals
     if normals is not None:
         size = np.linalg.norm(normals, axis=1, keepdims=True)

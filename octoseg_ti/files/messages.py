@@ -58,6 +58,7 @@ PARAMS_FIELDS = (
     ("regions_homogeneity", "double"),
     ("regions_min_points", "double"),
     ("regions_assign_edges", "bool"),
+    ("grid_edge_tolerance", "double"),
 )
 """octoseg.Params: "section_option" of `Params`, mm and rad; NaN = derived from the data."""
 

@@ -364,14 +364,15 @@ def build_grid(
     counts = runtime.download(heads)
     count = int(counts.sum())
     place = (np.cumsum(counts) - counts).astype(np.int32)
-    node = runtime.empty((2 * count, 7), np.int32)
+    rows = max(2 * count, n // 8)  # a guess, so that the tables seldom have to grow
+    node = runtime.empty((rows, 7), np.int32)
     root = runtime.upload(np.full(shape[0] * shape[1] * shape[2], -1, np.int32))
     _emit_heads(
         n, workers, stride, 3 * depth, ti.Vector(shape), key, runtime.upload(place), node, root
     )
 
-    child = runtime.empty((2 * count, 8), np.int32)
-    mean = runtime.empty((2 * count, 8), np.float64)
+    child = runtime.empty((rows, 8), np.int32)
+    mean = runtime.empty((rows, 8), np.float64)
     first, level, passes = 0, 0, 1
     while count > first:
         cell = size / 2.0**level

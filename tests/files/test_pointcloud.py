@@ -112,7 +112,8 @@ def test_tables_refuse_the_view_frame(tmp_path, suffix):
         hnp.array_shapes(min_dims=2, max_dims=2, min_side=3, max_side=3).map(
             lambda s: (s[0] * 2, 3)
         ),
-        elements=st.floats(allow_nan=True, allow_infinity=True, width=64),
+        # No subnormal numbers: the compiler of the kernels makes the process treat them as zero.
+        elements=st.floats(allow_nan=True, allow_infinity=True, allow_subnormal=False, width=64),
     )
 )
 @pytest.mark.parametrize("suffix", [".npz", *TABLES])
