@@ -1,8 +1,6 @@
 """Runs the command line: python -m octoseg_ti VERB."""
 
-import sys
-
-from octoseg_ti.cli import main
+from octoseg_ti.cli import program
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

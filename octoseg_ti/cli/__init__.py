@@ -6,6 +6,7 @@ failed, 2 wrong usage, 130 interrupted. The module of a verb is imported only wh
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import traceback
@@ -65,6 +66,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         _complain(_explain(error))
         return FAILED
+
+
+def program() -> None:
+    """Run one verb and end the process: what the command ``octoseg`` calls.
+
+    Taking Taichi down object by object at the end takes a quarter of a second, a tenth of a short
+    run. Its kernels are saved and the process left at once, unless the viewer is loaded too, which
+    has work of its own to finish.
+    """
+    code = main()
+    if "rerun" in sys.modules:
+        sys.exit(code)
+    runtime = sys.modules.get("octoseg_ti.device.runtime")
+    if runtime is not None:
+        runtime.finish()
+    with contextlib.suppress(OSError, ValueError):
+        sys.stderr.flush()
+    os._exit(code)
 
 
 def _dispatch(arguments: list[str]) -> int:

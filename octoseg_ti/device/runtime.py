@@ -195,3 +195,9 @@ def sync() -> None:
     """Wait until every launched kernel has ended."""
     if _started is not None:
         ti.sync()
+
+
+def finish() -> None:
+    """Save the compiled kernels and take Taichi down; the process starts it no more."""
+    if _started is not None:
+        ti.reset()

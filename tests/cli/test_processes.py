@@ -39,6 +39,16 @@ def test_exit_codes_of_the_process(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
+def test_the_quick_end_of_a_run_keeps_the_kernels(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OCTOSEG_CACHE", str(tmp_path / "kernels"))
+    done = _run("segment", recording, "-o", tmp_path / "out.npz", "--quiet")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert len(list((tmp_path / "kernels").rglob("*.tic"))) > 10
+    assert (tmp_path / "out.npz").stat().st_size > 0
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")
 @pytest.mark.parametrize("reader", ["head -1", "true"])
 def test_closed_pipe_is_quiet(recording: Path, reader: str) -> None:
