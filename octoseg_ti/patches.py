@@ -19,7 +19,7 @@ from octoseg_ti.stages.assignment import (
 )
 from octoseg_ti.stages.bends import split_at_bends
 from octoseg_ti.stages.grid import Grid
-from octoseg_ti.stages.moments import HI, LEVEL, LO, NORMAL, SIGMA, STOP, X, Z
+from octoseg_ti.stages.moments import LEVEL, NORMAL, SIGMA, STOP, X, Z
 from octoseg_ti.stages.planes import fit_planes
 from octoseg_ti.stages.regions import flood_fill, number_groups, strips
 from octoseg_ti.types import NONE, Cells, EdgeClass, Measurement, Scans, Segmentation
@@ -157,11 +157,10 @@ def assemble(
         points[left_out] = scans_in_world(scans, left_out)
     mean = runtime.download(grid.mean)[leaves]
     cells = Cells(
-        corner=grid.corner
-        + node[leaves, X : Z + 1] * (grid.size / 2.0 ** node[leaves, LEVEL])[:, None],
-        size=grid.size / 2.0 ** node[leaves, LEVEL],
+        corner=grid.corner + node[leaves, X : Z + 1] * grid.edge_length[leaves, None],
+        size=grid.edge_length[leaves],
         level=node[leaves, LEVEL].astype(np.int8),
-        count=node[leaves, HI] - node[leaves, LO],
+        count=grid.holds[leaves],
         normal=mean[:, NORMAL : NORMAL + 3].astype(np.float32),
         sigma=mean[:, SIGMA].astype(np.float32),
         stop=node[leaves, STOP].astype(np.uint8),

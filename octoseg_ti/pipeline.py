@@ -17,7 +17,7 @@ from octoseg_ti.stages.cleaning import mark_outliers
 from octoseg_ti.stages.edges import edges_by_level, edges_by_radius, edges_by_reason
 from octoseg_ti.stages.grid import Grid, build_grid
 from octoseg_ti.stages.measure import stripe_noise, stripe_spacing
-from octoseg_ti.stages.moments import LEVEL, LO, STOP
+from octoseg_ti.stages.moments import LEVEL, STOP
 from octoseg_ti.stages.neighbors import neighbor_normals
 from octoseg_ti.stages.normals import edge_pair_normals
 from octoseg_ti.stages.registration import to_world
@@ -208,7 +208,7 @@ def find_edges(grid: Grid, params: Params) -> tuple[np.ndarray, np.ndarray]:
     """Return the leaves in Morton order, and the edge class of each."""
     node = runtime.download(grid.node)[: grid.count]
     leaves = np.flatnonzero(runtime.download(grid.child)[: grid.count, 0] == -2)
-    leaves = leaves[np.argsort(node[leaves, LO], kind="stable")]
+    leaves = leaves[np.argsort(grid.first[leaves], kind="stable")]
     level = node[leaves, LEVEL]
     if params.edges.rule == "reason":
         return leaves, edges_by_reason(node[leaves, STOP])
@@ -217,5 +217,5 @@ def find_edges(grid: Grid, params: Params) -> tuple[np.ndarray, np.ndarray]:
             level, params.edges.smallest_levels, params.edges.fillet_levels
         )
     assert params.grid.tolerance is not None
-    size = grid.size / 2.0**level
+    size = grid.edge_length[leaves]
     return leaves, edges_by_radius(size, params.grid.tolerance, params.edges.radius)

@@ -10,7 +10,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.stages.grid import Grid, find_node
-from octoseg_ti.stages.moments import HI, LEVEL, LO, POINT
+from octoseg_ti.stages.moments import LEVEL, POINT
 from octoseg_ti.types import NONE
 
 _ROUNDS = 3
@@ -185,8 +185,7 @@ def points_of_leaves(grid: Grid, leaves: np.ndarray, values: np.ndarray) -> np.n
     Returns:
         The value of every sorted point, shape (n,).
     """
-    node = runtime.download(grid.node)
-    return np.repeat(values, node[leaves, HI] - node[leaves, LO])
+    return np.repeat(values, grid.holds[leaves])
 
 
 def assign_points(
@@ -274,12 +273,11 @@ def claimed_share(
     Returns:
         Share of labelled points, 0 for an empty group, shape (G,), f64.
     """
-    node = runtime.download(grid.node)
     of_leaf = group[leaves]
     inside = of_leaf >= 0
     groups = int(group.max(initial=NONE)) + 1
-    labelled = np.add.reduceat((label >= 0).astype(np.int32), node[leaves, LO])[inside]
-    count = (node[leaves, HI] - node[leaves, LO])[inside]
+    labelled = np.add.reduceat((label >= 0).astype(np.int32), grid.first[leaves])[inside]
+    count = grid.holds[leaves[inside]]
     total = np.bincount(of_leaf[inside], weights=count, minlength=groups)
     found = np.bincount(of_leaf[inside], weights=labelled, minlength=groups)
     return found / np.maximum(total, 1)

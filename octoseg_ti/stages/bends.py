@@ -194,9 +194,8 @@ def split_at_bends(
     Returns:
         Group of every node after the cuts, -1 for the cells that were removed: the bends.
     """
-    node = runtime.download(grid.node)[: grid.count]
     mean = runtime.download(grid.mean)[: grid.count]
-    count = node[:, HI] - node[:, LO]
+    count = grid.holds
     result = group.copy()
     suspects = _suspects(group, count, mean[:, NORMAL : NORMAL + 3], 2 * min_points, flat)
     if not suspects:

@@ -61,6 +61,12 @@ class Grid:
     """Daughters of every node, -1 if empty; first entry -2 for a leaf; shape (M, 8), i32."""
     mean: Any
     """Mean normal (3), mean point (3), deviation, residual of every node, shape (M, 8), f64."""
+    first: np.ndarray
+    """First sorted point of every node, shape (M,), i32 (host, as are the next two)."""
+    holds: np.ndarray
+    """Points of every node, shape (M,), i32."""
+    edge_length: np.ndarray
+    """Edge length of every node [mm], shape (M,), f64."""
     passes: int
     """Subdivision passes, counting the initial grid."""
 
@@ -408,7 +414,11 @@ def build_grid(
         _emit_children(first, count, level, daughters, runtime.upload(place), bound, node, child)
         passes += int(total > count)
         first, count, level = count, total, level + 1
+    host = runtime.download(node)[:count]
+    lo = np.ascontiguousarray(host[:, LO])
+    sizes = size / 2.0 ** np.arange(AXIS_BITS + 1)
     return Grid(
         corner=corner, size=size, shape=shape, depth=depth, signed=signed, count=count, order=order,
         point=sorted_point, root=root, node=node, child=child, mean=mean, passes=passes,
+        first=lo, holds=host[:, HI] - lo, edge_length=sizes[host[:, LEVEL]],
     )  # fmt: skip

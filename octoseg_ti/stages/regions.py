@@ -12,7 +12,7 @@ from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.unionfind import find, unite
 from octoseg_ti.stages.adjacency import Adjacency
 from octoseg_ti.stages.grid import Grid
-from octoseg_ti.stages.moments import HI, LEVEL, LO, POINT
+from octoseg_ti.stages.moments import POINT
 from octoseg_ti.types import NONE
 
 # A face has at least this share of its area in cells that touch no larger face.
@@ -181,10 +181,8 @@ def number_groups(grid: Grid, group: np.ndarray, min_points: int) -> np.ndarray:
 
 def group_sizes(grid: Grid, group: np.ndarray) -> np.ndarray:
     """Return the points of every group, by its name, shape (M,), f64 (whole numbers)."""
-    node = runtime.download(grid.node)[: grid.count]
     inside = group >= 0
-    count = node[inside, HI] - node[inside, LO]
-    return np.bincount(group[inside], weights=count, minlength=grid.count)
+    return np.bincount(group[inside], weights=grid.holds[inside], minlength=grid.count)
 
 
 def strips(grid: Grid, touching: Adjacency, group: np.ndarray) -> np.ndarray:
@@ -198,9 +196,8 @@ def strips(grid: Grid, touching: Adjacency, group: np.ndarray) -> np.ndarray:
         touching: Its touching pairs of leaves.
         group: Group of every node, named by its first node, -1 = none, shape (M,), i32.
     """
-    node = runtime.download(grid.node)[: grid.count]
     inner = inner_cells(touching, group, group_sizes(grid, group))
-    area = (grid.size / 2.0 ** node[:, LEVEL]) ** 2
+    area = grid.edge_length**2
     inside = group >= 0
     whole = np.bincount(group[inside], weights=area[inside], minlength=grid.count)
     core = np.bincount(group[inner], weights=area[inner], minlength=grid.count)
