@@ -16,9 +16,10 @@ import numpy as np
 import platformdirs
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-import taichi as ti
-
 from octoseg_ti.device import tracing
+
+with tracing.quick_import():
+    import taichi as ti
 
 tracing.speed_up(ti.lang.kernel_impl, ti.lang.ast.ast_transformer_utils)
 

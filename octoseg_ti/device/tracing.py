@@ -7,12 +7,20 @@ reads, wraps and parses the source of a function again at each of its calls. Her
 one line, and sources are read once. For each decorated function it also searches all modules to
 learn whether it stands in a class; ours never do. Names of Taichi that are not there (another
 version) leave everything as it was.
+
+Taichi also asks a server for its newest version when it starts. A tool that works on other people's
+parts asks nobody: that module is replaced by one that does nothing, which also spares its imports.
 """
 
 import ast
+import contextlib
 import functools
+import inspect
+import linecache
+import sys
 import textwrap
-from types import ModuleType, SimpleNamespace
+from collections.abc import Callable, Iterator
+from types import FrameType, ModuleType, SimpleNamespace
 from typing import Any
 
 
@@ -25,6 +33,75 @@ def _position(self: Any, node: Any) -> str:
     )
 
 
+def _frame_info(frame: FrameType, context: int = 1) -> inspect.Traceback:
+    """Return what `inspect.getframeinfo` says about a frame, without a search for its module."""
+    code = frame.f_code
+    line = linecache.getline(code.co_filename, frame.f_lineno)
+    return inspect.Traceback(code.co_filename, frame.f_lineno, code.co_name, [line], 0)
+
+
+@contextlib.contextmanager
+def quick_import() -> Iterator[None]:
+    """Let Taichi be imported without asking home, and without searching modules a thousand times.
+
+    Its own library of decorated functions is read in the import; for each it looks at the source
+    line where the decorator stands.
+    """
+    silent = ModuleType("taichi._version_check")
+    silent.start_version_check_thread = lambda: None  # type: ignore[attr-defined]
+    sys.modules.setdefault("taichi._version_check", silent)
+    thorough = inspect.getframeinfo
+    inspect.getframeinfo = _frame_info  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        inspect.getframeinfo = thorough
+
+
+def _source_lines(thorough: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return a faster `inspect.getsourcelines` for functions at the top of a module.
+
+    Such a function ends before the next line that begins in the first column, apart from comments
+    and from brackets that close its signature. What does not parse is left to the thorough way.
+    """
+
+    @functools.cache
+    def lines_of(function: Any) -> tuple[list[str], int]:
+        code = getattr(function, "__code__", None)
+        lines = linecache.getlines(code.co_filename) if code is not None else []
+        if not lines or code.co_firstlineno > len(lines):
+            return thorough(function)  # type: ignore[no-any-return]
+        first = code.co_firstlineno - 1
+        end = first
+        while end < len(lines) and not lines[end].startswith(("def ", "async def ")):
+            end += 1
+        end += 1
+        while end < len(lines) and (lines[end][0].isspace() or lines[end][0] in ")]}#"):
+            end += 1
+        block = lines[first:end]
+        while block and (not block[-1].strip() or block[-1][0] == "#"):
+            block.pop()
+        try:
+            # As Taichi puts it together, so that the tree is there when it asks for it.
+            text = "\n".join(_fill(line, tabsize=4, width=9999) for line in block)
+            body = _parse(textwrap.dedent(text)).body
+        except SyntaxError:
+            body = []
+        if len(body) != 1 or getattr(body[0], "name", "") != function.__name__:
+            return thorough(function)  # type: ignore[no-any-return]
+        return block, first + 1
+
+    return lines_of
+
+
+_fill = functools.cache(textwrap.fill)
+
+
+@functools.cache
+def _parse(text: str) -> ast.Module:
+    return ast.parse(text)
+
+
 def speed_up(kernel_impl: Any, transformer: Any) -> None:
     """Replace the slow text functions in Taichi's translator.
 
@@ -35,19 +112,19 @@ def speed_up(kernel_impl: Any, transformer: Any) -> None:
     context: Any = getattr(transformer, "ASTTransformerContext", None)
     if hasattr(context, "get_pos_info"):
         context.get_pos_info = _position
-    for name in ("getsourcelines", "getsourcefile"):
-        read = getattr(kernel_impl, name, None)
-        if read is not None:
-            setattr(kernel_impl, name, functools.cache(read))
+    if hasattr(kernel_impl, "getsourcelines"):
+        kernel_impl.getsourcelines = _source_lines(kernel_impl.getsourcelines)
+    if hasattr(kernel_impl, "getsourcefile"):
+        kernel_impl.getsourcefile = functools.cache(kernel_impl.getsourcefile)
     if hasattr(kernel_impl, "_inside_class"):
         kernel_impl._inside_class = lambda level_of_class_stackframe: False
     if hasattr(kernel_impl, "ast"):
         # A tree may be walked again: unrolled loops do that with their bodies.
         parser = ModuleType("ast")
         parser.__dict__.update(vars(ast))
-        parser.parse = functools.cache(ast.parse)  # type: ignore[attr-defined]
+        parser.parse = _parse  # type: ignore[attr-defined]
         kernel_impl.ast = parser
     if hasattr(kernel_impl, "textwrap"):
         kernel_impl.textwrap = SimpleNamespace(
-            fill=functools.cache(textwrap.fill), dedent=functools.cache(textwrap.dedent)
+            fill=_fill, dedent=functools.cache(textwrap.dedent)
         )
