@@ -7,6 +7,7 @@ failed, 2 wrong usage, 130 interrupted. The module of a verb is imported only wh
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import sys
 import traceback
@@ -27,6 +28,8 @@ VERBS = {
     "paper": ("paper", "redo the examples of the paper that the method comes from"),
 }
 """Verb -> (module in this package, one line of help). A module has OPTIONS and run_<verb>."""
+
+_COLLECT_AFTER = 200_000  # new objects between two runs of the garbage collector
 
 DONE, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 
@@ -73,8 +76,12 @@ def program() -> None:
 
     Taking Taichi down object by object at the end takes a quarter of a second, a tenth of a short
     run. Its kernels are saved and the process left at once, unless the viewer is loaded too, which
-    has work of its own to finish.
+    has work of its own to finish. Translating kernels makes a hundred thousand small objects that
+    stay: the collector would walk over them again and again. And the matrices here are small: a
+    second thread for them is only there to wait.
     """
+    gc.set_threshold(_COLLECT_AFTER)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     code = main()
     if "rerun" in sys.modules:
         sys.exit(code)

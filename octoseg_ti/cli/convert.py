@@ -49,8 +49,7 @@ def run_convert(options: ConvertOptions) -> int:
 
     check_inputs([options.input])
     check_outputs([options.output])
-    scans = files.read(options.input, topic=options.topic, unit=options.unit)
-    truth = files.read_truth(options.input)
+    scans, truth = files.read_with_truth(options.input, topic=options.topic, unit=options.unit)
     result = result_in(options.input)
     if result is None:
         files.write(options.output, scans, truth=truth)

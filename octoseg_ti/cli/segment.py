@@ -79,8 +79,7 @@ def run_segment(options: SegmentOptions) -> int:
     check_outputs(options.output)
     options.machine.start()
     began = time.perf_counter()
-    scans = files.read(options.input, topic=options.topic, unit=options.unit)
-    truth = files.read_truth(options.input)
+    scans, truth = files.read_with_truth(options.input, topic=options.topic, unit=options.unit)
 
     from octoseg_ti.pipeline import segment
 

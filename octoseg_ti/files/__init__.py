@@ -88,6 +88,15 @@ def read_truth(path: str | Path) -> Truth | None:
     return module.read_truth(path) if suffix_of(path) in _SELF_DESCRIBING else None
 
 
+def read_with_truth(
+    path: str | Path, *, unit: Unit | None = None, topic: str | None = None
+) -> tuple[Scans, Truth | None]:
+    """Read scans and their truth, as `read` and `read_truth` do; a recording is read only once."""
+    if suffix_of(path) == ".mcap" and unit in (None, "m"):
+        return _reader(path).read_scans_and_truth(path, topic=topic)  # type: ignore[no-any-return]
+    return read(path, unit=unit, topic=topic), read_truth(path)
+
+
 def read_segmentation(path: str | Path) -> Segmentation:
     """Read a result that `write` has made.
 

@@ -45,6 +45,7 @@ def write_recording(
             add_params(writer, segmentation)
         if scans is not None:
             writer.add(scans, truth)
+            writer.seal_scans()
         if segmentation is not None:
             column = None if scans is None else scans.column
             add_result(writer, segmentation, column=column, report=report, scores=scores)

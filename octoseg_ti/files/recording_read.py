@@ -102,8 +102,29 @@ def read_scans(path: str | Path, *, topic: str | None = None) -> Scans:
     Raises:
         DataError: Damaged, no such topic, several topics to choose from, or no points.
     """
-    wanted = {topic or SCAN_TOPIC, "/tf"}
-    contents = collect(path, None if topic is None else wanted)
+    return _scans_in(_collected(path, topic), topic)
+
+
+def read_scans_and_truth(
+    path: str | Path, *, topic: str | None = None
+) -> tuple[Scans, Truth | None]:
+    """Read scan lines, and their truth when there is one, in one pass over the file.
+
+    Raises:
+        DataError: As `read_scans` and `read_truth`.
+    """
+    contents = _collected(path, topic)
+    return _scans_in(contents, topic), _truth_in(contents)
+
+
+def _collected(path: str | Path, topic: str | None) -> Contents:
+    """Return what `read_scans` needs of a recording, and the truth with it."""
+    return collect(path, None if topic is None else {topic, SCAN_TOPIC, "/tf"})
+
+
+def _scans_in(contents: Contents, topic: str | None) -> Scans:
+    """Return the scan lines that were collected."""
+    path = contents.path
     channel = _cloud_channel(contents, topic)
     ours = "octoseg.run" in contents.metadata
     mine = [m for m in contents.messages if m.channel_id == channel.id]
@@ -123,13 +144,19 @@ def read_truth(path: str | Path) -> Truth | None:
     Raises:
         DataError: Damaged, or the truth does not fit the points.
     """
-    contents = collect(path, {SCAN_TOPIC})
+    return _truth_in(collect(path, {SCAN_TOPIC}))
+
+
+def _truth_in(contents: Contents) -> Truth | None:
+    """Return the truth that was collected."""
+    path = contents.path
     attachment = contents.attachments.get("ground_truth.npz")
     if attachment is None:
         return None
     _cloud_channel(contents, None)
+    own = {c.id for c in contents.channels.values() if c.topic == SCAN_TOPIC}
     with parsing(path, "MCAP", BROKEN):
-        points = positions(_rows(contents.messages)[0])
+        points = positions(_rows([m for m in contents.messages if m.channel_id in own])[0])
         values = archives.unpack_truth(attachment.data, points)
         return make_truth(path, values, len(points))
 

@@ -7,6 +7,7 @@ probe travel in ``/tf``. ``sequence`` is the stripe number, ``log_time`` the tim
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -90,6 +91,7 @@ class RecordingWriter:
         self._layouts: dict[str, CloudLayout] = {}
         self._stripes = 0
         self._form: tuple[bool, ...] | None = None
+        self._sealed: Future[bytes] | None = None
         self._output = AtomicFile(path, overwrite=overwrite)
         self._done = False
         try:
@@ -173,7 +175,7 @@ class RecordingWriter:
         Raises:
             DataError: The disk is full, or positions need double precision after a first piece
                 that did not.
-            ValueError: A piece has other arrays than the first one.
+            ValueError: A piece has other arrays than the first one, or the scans were sealed.
         """
         form = tuple(
             value is not None
@@ -186,6 +188,8 @@ class RecordingWriter:
                 truth,
             )
         )
+        if self._sealed is not None:
+            raise ValueError("no scans can be added after seal_scans")
         if self._form is None:
             self._form = form
         elif self._form != form:
@@ -225,6 +229,13 @@ class RecordingWriter:
                 self.write("/truth/lines", truth_layout.pack(truth_part[a:b], stamp), time, number)
         self._stripes += len(first)
         self.time_ns = max(self.time_ns, times[-1])
+
+    def seal_scans(self) -> None:
+        """Say that no more scans come: their truth is packed while other messages are written."""
+        if self._truth and self._sealed is None:
+            worker = ThreadPoolExecutor(max_workers=1)
+            self._sealed = worker.submit(self._pack_truth)
+            worker.shutdown(wait=False)
 
     def register(self, topic: str, message_class: Any, notes: Mapping[str, str]) -> None:
         """Open a channel, with its schema, unless the topic is there."""
@@ -289,8 +300,7 @@ class RecordingWriter:
             if extras:
                 self.attach("scan.npz", "application/zip", archives.pack(extras))
             if self._truth:
-                truth, points = joined(self._truth), np.concatenate(self._points)
-                content = archives.pack_truth(truth, points)
+                content = self._sealed.result() if self._sealed else self._pack_truth()
                 self.attach("ground_truth.npz", "application/zip", content)
             self._writer.finish()
         except BaseException:
@@ -307,6 +317,10 @@ class RecordingWriter:
     def has_stripes(self) -> bool:
         """Say whether any points were added."""
         return self._stripes > 0
+
+    def _pack_truth(self) -> bytes:
+        """Return the attachment with the truth of all pieces."""
+        return archives.pack_truth(joined(self._truth), np.concatenate(self._points))
 
     def _layout(self, topic: str, dtype: np.dtype, notes: Mapping[str, str]) -> CloudLayout:
         """Return the layout of a cloud topic, and open the topic when it is new."""
