@@ -117,9 +117,11 @@ def arrange(scans: Scans, drop: np.ndarray | None = None) -> Arranged:
     """
     usable = np.ones(len(scans.points), bool) if drop is None else ~drop
     for rows in (scans.points, scans.normals):
-        finite = None if rows is None else np.isfinite(rows)
-        if finite is not None and not finite.all():
-            usable &= finite.all(axis=1)
+        # A sum is finite only if all numbers are; that says it for most inputs at once.
+        with np.errstate(over="ignore", invalid="ignore"):
+            finite = rows is None or np.isfinite(rows.sum())
+        if rows is not None and not finite:
+            usable &= np.isfinite(rows).all(axis=1)
     whole = bool(usable.all())
     row = np.arange(len(usable)) if whole else np.flatnonzero(usable)
     if len(row) < 3:
@@ -169,7 +171,7 @@ def _arranged(
         normals = np.divide(normals, size, out=np.zeros_like(normals), where=usable)[row]
     return Arranged(
         row=row,
-        points=scans.points if whole else scans.points[row],
+        points=scans.points if whole else scans.points.take(row, axis=0),
         normals=normals,
         view=np.ascontiguousarray(view, np.int32),
         run=run,

@@ -134,27 +134,17 @@ def assemble(
     rank = np.argsort(-size, kind="stable")
     name = np.full(patches + 1, NONE, np.int32)
     name[rank] = np.arange(patches, dtype=np.int32)
-    label, cell_label = name[label], name[cell_label]
-    core = points_of_leaves(grid, leaves, cell_label[leaves])
+    cell_label = name[cell_label]
     flat = 2.0 * measured.noise + 0.02 * spacing_of(measured)
-    kind, parameters, residual = fit_planes(grid, core, patches, limit=flat)
-
+    kind, parameters, residual = fit_planes(grid, leaves, cell_label[leaves], patches, limit=flat)
     n = len(scans)
-    labels, levels, edges = to_rows(
-        grid, leaves, edge, label, None if arranged.whole else arranged.row, n
-    )
+    rows = to_rows(grid, leaves, edge, label, name[:patches], point, normal, arranged.row, n)
     outlier = np.zeros(n, np.uint8)
     if not arranged.whole:
         outlier[:] = 1
         outlier[arranged.row] = 0
-    if arranged.whole:
-        normals = normal.astype(np.float32)
-        points = point.copy() if np.shares_memory(point, scans.points) else point
-    else:
-        normals, points = np.zeros((n, 3), np.float32), np.full((n, 3), np.nan)
-        normals[arranged.row], points[arranged.row] = normal, point
         left_out = np.flatnonzero(outlier)
-        points[left_out] = scans_in_world(scans, left_out)
+        rows.points[left_out] = scans_in_world(scans, left_out)
     mean = runtime.download(grid.mean)[leaves]
     cells = Cells(
         corner=grid.corner + node[leaves, X : Z + 1] * grid.edge_length[leaves, None],
@@ -169,9 +159,9 @@ def assemble(
         initial_size=grid.size,
     )
     return Segmentation(
-        points=points, normals=normals, labels=labels, edge=edges, level=levels, outlier=outlier,
-        kind=kind, surface=np.arange(patches, dtype=np.int32), parameters=parameters,
-        residual=residual, cells=cells, stripe=scans.stripe, view=scans.view, params=params,
+        points=rows.points, normals=rows.normals, labels=rows.labels, edge=rows.edge,
+        level=rows.level, outlier=outlier, kind=kind, surface=np.arange(patches, dtype=np.int32),
+        parameters=parameters, residual=residual, cells=cells, stripe=scans.stripe, view=scans.view, params=params,
         measured=measured, passes=grid.passes, name=scans.name,
     )  # fmt: skip
 

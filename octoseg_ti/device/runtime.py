@@ -175,16 +175,16 @@ def zeros(shape: int | tuple[int, ...], dtype: type) -> Any:
     return ti.ndarray(_TAICHI_DTYPE[np.dtype(dtype).name], tuple(max(s, 1) for s in shape))
 
 
-def grown(array: Any, rows: int) -> Any:
-    """Return a copy with more rows; the values of the new ones are undefined."""
-    larger = empty((rows, *array.shape[1:]), download(array[:0] if on_cpu() else array).dtype.type)
+def grown(array: Any, rows: int, *, zeros: bool = False) -> Any:
+    """Return a copy with more rows; the values of the new ones are undefined, or zero."""
+    shape = (rows, *array.shape[1:])
     if on_cpu():
+        larger = np.zeros(shape, array.dtype) if zeros else np.empty(shape, array.dtype)
         larger[: array.shape[0]] = array
-    else:
-        host = np.zeros(tuple(larger.shape), download(array).dtype)
-        host[: array.shape[0]] = download(array)
-        larger.from_numpy(host)
-    return larger
+        return larger
+    host = np.zeros(shape, download(array).dtype)
+    host[: array.shape[0]] = download(array)
+    return upload(host)
 
 
 def download(array: Any) -> np.ndarray:

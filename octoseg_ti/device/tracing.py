@@ -125,6 +125,4 @@ def speed_up(kernel_impl: Any, transformer: Any) -> None:
         parser.parse = _parse  # type: ignore[attr-defined]
         kernel_impl.ast = parser
     if hasattr(kernel_impl, "textwrap"):
-        kernel_impl.textwrap = SimpleNamespace(
-            fill=_fill, dedent=functools.cache(textwrap.dedent)
-        )
+        kernel_impl.textwrap = SimpleNamespace(fill=_fill, dedent=functools.cache(textwrap.dedent))

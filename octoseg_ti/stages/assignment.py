@@ -4,11 +4,13 @@ A point of an edge cell looks at the labelled cells around it and joins the one 
 lies on. It looks one smallest cell away, then two, then three: an edge band is a cell or two wide.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
-from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
+from octoseg_ti.device.runtime import F32Rows, F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.stages.grid import Grid, find_node
 from octoseg_ti.stages.moments import LEVEL, POINT
 from octoseg_ti.types import NONE
@@ -100,10 +102,9 @@ def _runs(grid: Grid, index: np.ndarray, bend: np.ndarray | None) -> np.ndarray:
     Returns:
         First point, end, bend, and place of the first point in ``index``, shape (r, 4), i32.
     """
-    box = (runtime.download(grid.point)[index] * (2.0**grid.depth / grid.size)).astype(np.int32)
-    box = np.minimum(box, np.array(grid.shape) * 2**grid.depth - 1)  # the upper side of the grid
+    box = runtime.download(grid.key)[index]
     new = np.ones(len(index), bool)
-    new[1:] = (np.diff(index) > 1) | (box[1:] != box[:-1]).any(axis=1)
+    new[1:] = (index[1:] - index[:-1] > 1) | (box[1:] != box[:-1])
     first = np.flatnonzero(new)
     last = np.append(first[1:], len(index)) - 1
     runs = np.empty((len(first), 4), np.int32)
@@ -115,22 +116,48 @@ def _runs(grid: Grid, index: np.ndarray, bend: np.ndarray | None) -> np.ndarray:
 @ti.kernel
 def _scatter(
     # In:
+    order_in: I32Array,
     row_in: I32Array,
+    leaf_in: I32Rows,
     label_in: I32Array,
-    leaf_in: I32Array,
-    level_in: I32Array,
-    edge_in: I32Array,
+    name_in: I32Array,
+    point_in: F64Rows,
+    normal_in: F64Rows,
     # Out:
     label_out: I32Array,
     level_out: I32Array,
     edge_out: I32Array,
+    point_out: F64Rows,
+    normal_out: F32Rows,
 ):
-    """Write label, level and edge class of the sorted points to their rows."""
+    """Write label, level and edge class, position and normal of all points to their rows."""
+    for c in range(leaf_in.shape[0]):
+        for i in range(leaf_in[c, 0], leaf_in[c, 1]):
+            r = row_in[order_in[i]]
+            label = label_in[i]
+            label_out[r] = name_in[label] if label >= 0 else -1
+            level_out[r] = leaf_in[c, 2]
+            edge_out[r] = leaf_in[c, 3]
     for i in row_in:
         r = row_in[i]
-        label_out[r] = label_in[i]
-        level_out[r] = level_in[leaf_in[i]]
-        edge_out[r] = edge_in[leaf_in[i]]
+        for k in ti.static(range(3)):
+            point_out[r, k] = point_in[i, k]
+            normal_out[r, k] = ti.cast(normal_in[i, k], ti.f32)
+
+
+class Rows(NamedTuple):
+    """What is known of every row of the input; ``N`` rows."""
+
+    points: np.ndarray
+    """Positions [mm], shape (N, 3), f64; NaN for rows of no point."""
+    normals: np.ndarray
+    """Unit normals, shape (N, 3), f32; zero for rows of no point."""
+    labels: np.ndarray
+    """Patches, shape (N,), i32; -1 = none."""
+    level: np.ndarray
+    """Levels, shape (N,), i8; -1 = in no cell."""
+    edge: np.ndarray
+    """`EdgeClass`, shape (N,), u8."""
 
 
 def to_rows(
@@ -138,40 +165,65 @@ def to_rows(
     leaves: np.ndarray,
     edge: np.ndarray,
     label: np.ndarray,
-    row: np.ndarray | None,
+    name: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    row: np.ndarray,
     rows: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Bring labels, levels and edge classes of the sorted points into the order of the input.
+) -> Rows:
+    """Bring what is known of the points into the order of the input.
 
     Args:
         grid: The sparse grid.
         leaves: The nodes that are leaves, in Morton order, shape (C,).
         edge: `EdgeClass` of every leaf, shape (C,).
         label: Label of every sorted point, shape (n,), i32.
-        row: Input row of every point of the grid, shape (n,), i64; None = the points as they are.
-        rows: Number of input rows; those of no point get label -1, level -1 and no edge.
+        name: New name of every label, shape (K,), i32.
+        points: Positions of the points of the grid as they were given [mm], shape (n, 3), f64.
+        normals: Their unit normals, shape (n, 3), f64.
+        row: Input row of every one of these points, shape (n,), i64.
+        rows: Number of input rows N.
 
     Returns:
-        Labels, shape (rows,), i32; levels, shape (rows,), i8; edge classes, shape (rows,), u8.
+        The rows.
     """
     runtime.ensure_started()
-    node = runtime.download(grid.node)
-    level = node[leaves, LEVEL]
-    leaf = points_of_leaves(grid, leaves, np.arange(len(leaves), dtype=np.int32))
-    at = grid.order
-    if row is not None:
-        at = runtime.upload(row[runtime.download(grid.order)].astype(np.int32))
-    out = [runtime.upload(np.full(rows, value, np.int32)) for value in (NONE, -1, 0)]
-    _scatter(
-        at,
-        runtime.upload(label),
-        runtime.upload(leaf),
-        runtime.upload(level),
-        runtime.upload(edge.astype(np.int32)),
-        *out,
+    leaf = np.empty((len(leaves), 4), np.int32)
+    leaf[:, 0] = grid.first[leaves]
+    leaf[:, 1] = leaf[:, 0] + grid.holds[leaves]
+    leaf[:, 2] = runtime.download(grid.node)[leaves, LEVEL]
+    leaf[:, 3] = edge
+    whole = len(row) == rows
+    labels, levels, edges = (
+        runtime.empty(rows, np.int32) if whole else runtime.upload(np.full(rows, value, np.int32))
+        for value in (NONE, -1, 0)
     )
-    labels, levels, edges = (runtime.download(a) for a in out)
-    return labels, levels.astype(np.int8), edges.astype(np.uint8)
+    placed = runtime.empty((rows, 3), np.float64)
+    turned = runtime.empty((rows, 3), np.float32)
+    if not whole:
+        placed = runtime.upload(np.full((rows, 3), np.nan))
+        turned = runtime.upload(np.zeros((rows, 3), np.float32))
+    _scatter(
+        grid.order,
+        runtime.upload(row.astype(np.int32)),
+        runtime.upload(leaf),
+        runtime.upload(label),
+        runtime.upload(name if len(name) else np.full(1, NONE, np.int32)),
+        runtime.upload(points),
+        runtime.upload(normals),
+        labels,
+        levels,
+        edges,
+        placed,
+        turned,
+    )
+    return Rows(
+        points=runtime.download(placed),
+        normals=runtime.download(turned),
+        labels=runtime.download(labels),
+        level=runtime.download(levels).astype(np.int8),
+        edge=runtime.download(edges).astype(np.uint8),
+    )
 
 
 def points_of_leaves(grid: Grid, leaves: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -186,6 +238,14 @@ def points_of_leaves(grid: Grid, leaves: np.ndarray, values: np.ndarray) -> np.n
         The value of every sorted point, shape (n,).
     """
     return np.repeat(values, grid.holds[leaves])
+
+
+def _points_in(grid: Grid, cells: np.ndarray) -> np.ndarray:
+    """Return the sorted points in some cells, cell after cell, i32."""
+    holds = grid.holds[cells]
+    ends = np.cumsum(holds, dtype=np.int32)
+    offset = grid.first[cells] - (ends - holds)
+    return np.arange(holds.sum(), dtype=np.int32) + np.repeat(offset, holds)
 
 
 def assign_points(
@@ -224,14 +284,14 @@ def assign_points(
     label = np.ascontiguousarray(points_of_leaves(grid, leaves, cell_label[leaves]), np.int32)
     if not np.any(cell_label >= 0):
         return label
-    asked = label < 0
+    asked = cell_label[leaves] < 0
     if only is not None:
-        asked &= points_of_leaves(grid, leaves, only[leaves])
-    index = np.flatnonzero(asked)
+        asked &= only[leaves]
+    asked = leaves[asked]
+    index = _points_in(grid, asked)
     on_bend = None
     if bend.any():
-        named = np.where(bend[leaves], leaves, NONE).astype(np.int32)
-        on_bend = points_of_leaves(grid, leaves, named)[index]
+        on_bend = np.repeat(np.where(bend[asked], asked, NONE).astype(np.int32), grid.holds[asked])
     device_cell = runtime.upload(cell_label.astype(np.int32))
     for r in range(1, rounds + 1):
         if len(index) == 0:
@@ -273,11 +333,13 @@ def claimed_share(
     Returns:
         Share of labelled points, 0 for an empty group, shape (G,), f64.
     """
-    of_leaf = group[leaves]
-    inside = of_leaf >= 0
     groups = int(group.max(initial=NONE)) + 1
-    labelled = np.add.reduceat((label >= 0).astype(np.int32), grid.first[leaves])[inside]
-    count = grid.holds[leaves[inside]]
-    total = np.bincount(of_leaf[inside], weights=count, minlength=groups)
-    found = np.bincount(of_leaf[inside], weights=labelled, minlength=groups)
+    inside = leaves[group[leaves] >= 0]
+    if len(inside) == 0:
+        return np.zeros(groups)
+    count = grid.holds[inside]
+    begin = np.cumsum(count) - count
+    labelled = np.add.reduceat((label[_points_in(grid, inside)] >= 0).astype(np.int32), begin)
+    total = np.bincount(group[inside], weights=count, minlength=groups)
+    found = np.bincount(group[inside], weights=labelled, minlength=groups)
     return found / np.maximum(total, 1)

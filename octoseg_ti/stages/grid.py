@@ -11,8 +11,9 @@ import numpy as np
 
 from octoseg_ti.device import radix, runtime
 from octoseg_ti.device.morton import AXIS_BITS, compacted, morton_keys
-from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, I64Array, ti
+from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, I64Array, I64Rows, ti
 from octoseg_ti.errors import DataError
+from octoseg_ti.stages.moments import COUNT as MOMENTS
 from octoseg_ti.stages.moments import (
     HI,
     LEVEL,
@@ -23,7 +24,8 @@ from octoseg_ti.stages.moments import (
     X,
     Y,
     Z,
-    describe_cells,
+    add_up,
+    describe,
 )
 from octoseg_ti.types import StopReason
 
@@ -53,6 +55,8 @@ class Grid:
     """Index of the points in Morton order, shape (n,), i32."""
     point: Any
     """Points in Morton order, relative to ``corner`` [mm], shape (n, 3), f64."""
+    key: Any
+    """Morton key of the smallest box of every sorted point, shape (n,), i64."""
     root: Any
     """Node of every initial cell, -1 if empty, shape (product of ``shape``,), i32."""
     node: Any
@@ -61,6 +65,8 @@ class Grid:
     """Daughters of every node, -1 if empty; first entry -2 for a leaf; shape (M, 8), i32."""
     mean: Any
     """Mean normal (3), mean point (3), deviation, residual of every node, shape (M, 8), f64."""
+    moment: Any
+    """Moments of every node (`stages.moments`), shape (M, 19), i64."""
     first: np.ndarray
     """First sorted point of every node, shape (M,), i32 (host, as are the next two)."""
     holds: np.ndarray
@@ -176,35 +182,36 @@ def _emit_heads(
 
 @ti.kernel
 def _decide(
-    first: ti.i32,
-    last: ti.i32,
-    min_points: ti.i32,
-    halt: ti.i32,
-    limit: ti.types.vector(3, ti.f64),
-    shift: ti.i32,
+    level: ti.types.vector(6, ti.i32),
+    limit: ti.types.vector(4, ti.f64),
     # In:
     key_in: I64Array,
-    mean_in: F64Rows,
+    moment_in: I64Rows,
     # Out:
     node_inout: I32Rows,
+    mean_out: F64Rows,
     count_out: I32Array,
     bound_out: I32Rows,
 ):
-    """Decide which nodes of a level are split, and where their daughters begin.
+    """Describe the nodes of a level, decide which are split, and where their daughters begin.
 
-    ``halt`` is the stop reason of this level, or 0 when its cells may be split. The limits are of
-    the deviation, of the residual, and of the deviation of a cell that cannot be split.
+    The level holds its first node, one past the last, the fewest points that are split, the stop
+    reason of this level (0 when its cells may be split), the shift of its keys, and whether normals
+    have a side. The limits are of the deviation, of the residual, and of the deviation of a cell
+    that cannot be split; then comes the size of the cells.
     """
-    for c in range(first, last):
+    first = level[0]
+    for c in range(first, level[1]):
+        describe(c, level[5], limit[3], node_inout, moment_in, mean_out)
         lo = node_inout[c, LO]
         hi = node_inout[c, HI]
         stop = 0
         count = 0
-        sigma = mean_in[c, SIGMA]
-        step = mean_in[c, RESIDUAL] > limit[1]
+        sigma = mean_out[c, SIGMA]
+        step = mean_out[c, RESIDUAL] > limit[1]
         if sigma > limit[0] or step:
-            stop = halt
-            if hi - lo < min_points:
+            stop = level[3]
+            if hi - lo < level[2]:
                 stop = _FEW_POINTS
             if stop != 0 and sigma <= limit[2] and not step:
                 stop = 0
@@ -215,7 +222,7 @@ def _decide(
                     b = hi
                     while a < b:  # the first point of a later octant
                         middle = (a + b) // 2
-                        if ti.cast((key_in[middle] >> shift) & 7, ti.i32) > o:
+                        if ti.cast((key_in[middle] >> level[4]) & 7, ti.i32) > o:
                             b = middle
                         else:
                             a = middle + 1
@@ -389,10 +396,11 @@ def build_grid(
 
     child = runtime.empty((rows, 8), np.int32)
     mean = runtime.empty((rows, 8), np.float64)
+    moment = runtime.zeros((rows, MOMENTS), np.int64)
     first, level, passes = 0, 0, 1
     while count > first:
         cell = size / 2.0**level
-        describe_cells(first, count, cell, signed, node, sorted_point, sorted_normal, mean)
+        add_up(first, count, cell, signed, node, sorted_point, sorted_normal, moment)
         halt = 0
         if cell / 2.0 < min_cell * (1.0 - 1e-9):
             halt = int(StopReason.MIN_SIZE)
@@ -402,8 +410,9 @@ def build_grid(
         bound = runtime.empty((count - first, 9), np.int32)
         residual = flatness * tolerance * cell + 3.0 * noise
         _decide(
-            first, count, min_points, halt, ti.Vector([tolerance, residual, roughness]),
-            3 * (depth - level - 1), key, mean, node, daughters, bound,
+            ti.Vector([first, count, min_points, halt, 3 * (depth - level - 1), int(signed)]),
+            ti.Vector([tolerance, residual, roughness, cell]),
+            key, moment, node, mean, daughters, bound,
         )  # fmt: skip
         counts = runtime.download(daughters)
         place = (count + np.cumsum(counts) - counts).astype(np.int32)
@@ -411,6 +420,7 @@ def build_grid(
         if total > node.shape[0]:
             rows = 2 * total
             node, child, mean = (runtime.grown(a, rows) for a in (node, child, mean))
+            moment = runtime.grown(moment, rows, zeros=True)
         _emit_children(first, count, level, daughters, runtime.upload(place), bound, node, child)
         passes += int(total > count)
         first, count, level = count, total, level + 1
@@ -419,6 +429,7 @@ def build_grid(
     sizes = size / 2.0 ** np.arange(AXIS_BITS + 1)
     return Grid(
         corner=corner, size=size, shape=shape, depth=depth, signed=signed, count=count, order=order,
-        point=sorted_point, root=root, node=node, child=child, mean=mean, passes=passes,
+        point=sorted_point, key=key, root=root, node=node, child=child, mean=mean, moment=moment,
+        passes=passes,
         first=lo, holds=host[:, HI] - lo, edge_length=sizes[host[:, LEVEL]],
     )  # fmt: skip

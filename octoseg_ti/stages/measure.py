@@ -21,9 +21,9 @@ _LAG = 3
 
 @ti.kernel
 def _measure_spacing(
-    step: ti.i32,
     runs: ti.i32,
     # In:
+    sample_in: I32Array,
     point_in: F64Rows,
     start_in: I32Array,
     view_in: I32Array,
@@ -33,42 +33,42 @@ def _measure_spacing(
     across_out: F32Array,
 ):
     """Write the distance to the next point of the stripe, and to the next stripe."""
-    for i in run_in:
-        along_out[i] = -1.0
-        across_out[i] = -1.0
+    for s in sample_in:
+        along_out[s] = -1.0
+        across_out[s] = -1.0
+        i = sample_in[s]
         run = run_in[i]
         lo = start_in[run]
         hi = start_in[run + 1]
-        if (i - lo) % step == 0:
-            p = row(point_in, i)
-            if i + 1 < hi:
-                along_out[i] = ti.cast((row(point_in, i + 1) - p).norm(), ti.f32)
-            if run + 1 < runs and view_in[start_in[ti.min(run + 1, runs - 1)]] == view_in[lo]:
-                # A guess by proportion, then downhill to the nearest point.
-                first = hi
-                last = start_in[run + 2] - 1
-                j = first + ti.cast((last - first) * ((i - lo) / ti.max(1, hi - lo - 1)), ti.i32)
-                best = (row(point_in, j) - p).norm()
-                moving = 1
-                while moving == 1:
-                    moving = 0
-                    for side in ti.static((-1, 1)):
-                        k = j + side
-                        if k >= first and k <= last:
-                            d = (row(point_in, k) - p).norm()
-                            if d < best:
-                                best = d
-                                j = k
-                                moving = 1
-                across_out[i] = ti.cast(best, ti.f32)
+        p = row(point_in, i)
+        if i + 1 < hi:
+            along_out[s] = ti.cast((row(point_in, i + 1) - p).norm(), ti.f32)
+        if run + 1 < runs and view_in[start_in[ti.min(run + 1, runs - 1)]] == view_in[lo]:
+            # A guess by proportion, then downhill to the nearest point.
+            first = hi
+            last = start_in[run + 2] - 1
+            j = first + ti.cast((last - first) * ((i - lo) / ti.max(1, hi - lo - 1)), ti.i32)
+            best = (row(point_in, j) - p).norm()
+            moving = 1
+            while moving == 1:
+                moving = 0
+                for side in ti.static((-1, 1)):
+                    k = j + side
+                    if k >= first and k <= last:
+                        d = (row(point_in, k) - p).norm()
+                        if d < best:
+                            best = d
+                            j = k
+                            moving = 1
+            across_out[s] = ti.cast(best, ti.f32)
 
 
 @ti.kernel
 def _measure_noise(
-    step: ti.i32,
     lag: ti.i32,
     gap: ti.f64,
     # In:
+    sample_in: I32Array,
     point_in: F64Rows,
     normal_in: F64Rows,
     start_in: I32Array,
@@ -81,30 +81,37 @@ def _measure_noise(
 
     With a lag of 3 the three normals share no triangle, so their errors are independent.
     """
-    for i in run_in:
-        range_out[i] = -1.0
-        tilt_out[i] = -1.0
+    for s in sample_in:
+        range_out[s] = -1.0
+        tilt_out[s] = -1.0
+        i = sample_in[s]
         lo = start_in[run_in[i]]
         hi = start_in[run_in[i] + 1]
         normal = row(normal_in, i)
-        if (i - lo) % step == 0 and normal.norm() > 0.5:
+        if normal.norm() > 0.5:
             p = row(point_in, i)
             if i - 1 >= lo and i + 1 < hi:
                 before = row(point_in, i - 1) - p
                 after = row(point_in, i + 1) - p
                 if before.norm() <= gap and after.norm() <= gap:
-                    range_out[i] = ti.cast(ti.abs((before + after).dot(normal)), ti.f32)
+                    range_out[s] = ti.cast(ti.abs((before + after).dot(normal)), ti.f32)
             if i - lag >= lo and i + lag < hi:
                 a = row(normal_in, i - lag)
                 b = row(normal_in, i + lag)
                 near = (row(point_in, i - lag) - row(point_in, i + lag)).norm()
                 if a.norm() > 0.5 and b.norm() > 0.5 and near <= 2 * lag * gap:
-                    tilt_out[i] = ti.cast((normal - 0.5 * (a + b)).norm(), ti.f32)
+                    tilt_out[s] = ti.cast((normal - 0.5 * (a + b)).norm(), ti.f32)
 
 
-def _step(n: int) -> int:
-    """Return the stride along a stripe that keeps about `_SAMPLES` points."""
-    return max(1, n // _SAMPLES)
+def _samples(start: np.ndarray) -> np.ndarray:
+    """Return about `_SAMPLES` points, evenly along every stripe from its first one, i32."""
+    step = max(1, int(start[-1]) // _SAMPLES)
+    counts = -(-np.diff(start) // step)
+    ends = np.cumsum(counts)
+    within = np.arange(ends[-1], dtype=np.int32) - np.repeat(
+        (ends - counts).astype(np.int32), counts
+    )
+    return np.repeat(start[:-1], counts) + np.int32(step) * within
 
 
 def _trimmed_mean(values: np.ndarray) -> float:
@@ -138,11 +145,12 @@ def stripe_spacing(
         Spacing along and across; 0 where nothing could be measured.
     """
     runtime.ensure_started()
-    n = len(points)
-    along, across = runtime.empty(n, np.float32), runtime.empty(n, np.float32)
+    sample = _samples(start)
+    along = runtime.empty(len(sample), np.float32)
+    across = runtime.empty(len(sample), np.float32)
     _measure_spacing(
-        _step(n),
         len(start) - 1,
+        runtime.upload(sample),
         runtime.upload(points),
         runtime.upload(start),
         runtime.upload(view),
@@ -172,12 +180,13 @@ def stripe_noise(
         Standard deviation of the range, and root mean square deviation of the normals.
     """
     runtime.ensure_started()
-    n = len(points)
-    second, tilt = runtime.empty(n, np.float32), runtime.empty(n, np.float32)
+    sample = _samples(start)
+    second = runtime.empty(len(sample), np.float32)
+    tilt = runtime.empty(len(sample), np.float32)
     _measure_noise(
-        _step(n),
         _LAG,
         gap,
+        runtime.upload(sample),
         runtime.upload(points),
         runtime.upload(normals),
         runtime.upload(start),

@@ -83,79 +83,105 @@ def _accumulate(
                         sums[13 + k] += _fixed(p[a] * p[b])
                     i += 1
                 for k in ti.static(range(COUNT)):
-                    ti.atomic_add(moment_inout[c - first, k], sums[k])
+                    ti.atomic_add(moment_inout[c, k], sums[k])
             c += 1
 
 
 @ti.func
 def _moments(moment: ti.template(), c: ti.i32, first: ti.i32, scale: ti.f64) -> vec3:
-    """Return three sums of a cell as means."""
+    """Return three sums of cell c as means."""
     return scale * vec3(moment[c, first], moment[c, first + 1], moment[c, first + 2])
 
 
-@ti.kernel
-def _describe(
-    first: ti.i32,
-    last: ti.i32,
+@ti.func
+def describe(
+    c: ti.i32,
     signed: ti.i32,
     size: ti.f64,
-    # In:
-    node_in: I32Rows,
-    moment_in: I64Rows,
-    # Out:
-    mean_out: F64Rows,
+    node: ti.template(),
+    moment: ti.template(),
+    mean: ti.template(),
 ):
-    """Write mean normal, mean point, deviation (Eq. 4) and residual of the nodes of a level."""
-    for c in range(first, last):
-        m = c - first
-        scale = 1.0 / (_ONE * ti.cast(moment_in[m, 0], ti.f64))
-        # Eq. 4 for unit normals: sigma^2 = 1 - |mean|^2. Points without a normal are no part of it.
-        nn = _moments(moment_in, m, 4, scale)
-        nm = _moments(moment_in, m, 7, scale)
-        present = ti.max(nn[0] + nm[0] + nm[2], 1e-12)
-        normal = _moments(moment_in, m, 1, scale)
-        variance = 1.0 - normal.norm_sqr() / (present * present)
-        if signed == 0:
-            # The mean axis, and the spread around it: the normals may point either way.
-            values, _, _, axis = symmetric_eigen(nn[0], nn[1], nn[2], nm[0], nm[1], nm[2])
-            normal = axis
-            variance = 1.0 - values[2] / present
-        length = normal.norm()
-        if length > 0.0:
-            normal = normal / length
-        p = _moments(moment_in, m, 10, scale)
-        pp = _moments(moment_in, m, 13, scale)
-        pm = _moments(moment_in, m, 16, scale)
-        cov = vec3(
-            (pp[0] - p[0] * p[0]) * normal[0] + 2.0 * (pp[1] - p[0] * p[1]) * normal[1],
-            (pm[0] - p[1] * p[1]) * normal[1] + 2.0 * (pm[1] - p[1] * p[2]) * normal[2],
-            (pm[2] - p[2] * p[2]) * normal[2] + 2.0 * (pp[2] - p[0] * p[2]) * normal[0],
-        )
-        middle = size * (vec3(node_in[c, X], node_in[c, Y], node_in[c, Z]) + 0.5)
-        for k in ti.static(range(3)):
-            mean_out[c, NORMAL + k] = normal[k]
-            mean_out[c, POINT + k] = middle[k] + 0.5 * size * p[k]
-        mean_out[c, SIGMA] = ti.sqrt(ti.max(0.0, variance))
-        mean_out[c, RESIDUAL] = 0.5 * size * ti.sqrt(ti.max(0.0, cov.dot(normal)))
+    """Write mean normal, mean point, deviation (Eq. 4) and residual of a cell from its moments."""
+    scale = 1.0 / (_ONE * ti.cast(moment[c, 0], ti.f64))
+    # Eq. 4 for unit normals: sigma^2 = 1 - |mean|^2. Points without a normal are no part of it.
+    nn = _moments(moment, c, 4, scale)
+    nm = _moments(moment, c, 7, scale)
+    present = ti.max(nn[0] + nm[0] + nm[2], 1e-12)
+    normal = _moments(moment, c, 1, scale)
+    variance = 1.0 - normal.norm_sqr() / (present * present)
+    if signed == 0:
+        # The mean axis, and the spread around it: the normals may point either way.
+        values, _, _, axis = symmetric_eigen(nn[0], nn[1], nn[2], nm[0], nm[1], nm[2])
+        normal = axis
+        variance = 1.0 - values[2] / present
+    length = normal.norm()
+    if length > 0.0:
+        normal = normal / length
+    p = _moments(moment, c, 10, scale)
+    pp = _moments(moment, c, 13, scale)
+    pm = _moments(moment, c, 16, scale)
+    cov = vec3(
+        (pp[0] - p[0] * p[0]) * normal[0] + 2.0 * (pp[1] - p[0] * p[1]) * normal[1],
+        (pm[0] - p[1] * p[1]) * normal[1] + 2.0 * (pm[1] - p[1] * p[2]) * normal[2],
+        (pm[2] - p[2] * p[2]) * normal[2] + 2.0 * (pp[2] - p[0] * p[2]) * normal[0],
+    )
+    middle = size * (vec3(node[c, X], node[c, Y], node[c, Z]) + 0.5)
+    for k in ti.static(range(3)):
+        mean[c, NORMAL + k] = normal[k]
+        mean[c, POINT + k] = middle[k] + 0.5 * size * p[k]
+    mean[c, SIGMA] = ti.sqrt(ti.max(0.0, variance))
+    mean[c, RESIDUAL] = 0.5 * size * ti.sqrt(ti.max(0.0, cov.dot(normal)))
 
 
-def describe_cells(
-    first: int, last: int, size: float, signed: bool, node: Any, point: Any, normal: Any, mean: Any
+def add_up(
+    first: int,
+    last: int,
+    size: float,
+    signed: bool,
+    node: Any,
+    point: Any,
+    normal: Any,
+    moment: Any,
 ) -> None:
-    """Write mean normal, mean point, deviation and residual of the cells of one level.
+    """Add up the moments of the cells of one level.
 
     Args:
         first: First cell of the level in the tables.
         last: One past its last cell.
         size: Edge length of its cells [mm].
         signed: Normals have a side; else their axes are averaged.
-        node: Integer table of the cells, shape (M, 8), i32; ranges of the sorted points.
+        node: Integer table of the cells, shape (M, 7), i32; ranges of the sorted points.
         point: Sorted points, relative to the corner of the grid [mm], shape (n, 3), f64.
         normal: Sorted unit normals, shape (n, 3), f64; a zero row counts as none.
-        mean: Real table of the cells, shape (M, 8), f64: the rows first..last-1 are written.
+        moment: Moments of the cells, shape (M, 19), i64: the rows first..last-1 are added to.
     """
     runtime.ensure_started()
-    moment = runtime.zeros((last - first, COUNT), np.int64)
     slices = -(-point.shape[0] // _SLICE)
     _accumulate(first, last, slices, int(signed), size, node, point, normal, moment)
-    _describe(first, last, int(signed), size, node, moment, mean)
+
+
+def point_sums(
+    moment: np.ndarray, middle: np.ndarray, size: np.ndarray, about: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return count, sum of positions and of their products for cells, measured from given places.
+
+    Args:
+        moment: Moments of the cells, shape (c, 19), i64.
+        middle: Middle of every cell [mm], shape (c, 3).
+        size: Edge length of every cell [mm], shape (c,).
+        about: The place to measure from, for every cell [mm], shape (c, 3).
+
+    Returns:
+        Counts, shape (c,), f64; sums [mm], shape (c, 3); sums of the products xx, xy, xz, yy, yz,
+        zz [mm^2], shape (c, 6).
+    """
+    count = moment[:, 0].astype(np.float64)
+    half = 0.5 * size[:, None]
+    first = moment[:, 10:13] * (half / _ONE)
+    second = moment[:, 13:19] * (half**2 / _ONE)
+    off = middle - about
+    a, b = list(_ROW), list(_COLUMN)
+    second = second + off[:, a] * first[:, b] + first[:, a] * off[:, b]
+    second += count[:, None] * off[:, a] * off[:, b]
+    return count, first + count[:, None] * off, second
