@@ -161,8 +161,8 @@ def assemble(
     return Segmentation(
         points=rows.points, normals=rows.normals, labels=rows.labels, edge=rows.edge,
         level=rows.level, outlier=outlier, kind=kind, surface=np.arange(patches, dtype=np.int32),
-        parameters=parameters, residual=residual, cells=cells, stripe=scans.stripe, view=scans.view, params=params,
-        measured=measured, passes=grid.passes, name=scans.name,
+        parameters=parameters, residual=residual, cells=cells, stripe=scans.stripe,
+        view=scans.view, params=params, measured=measured, passes=grid.passes, name=scans.name,
     )  # fmt: skip
 
 

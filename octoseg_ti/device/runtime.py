@@ -16,12 +16,13 @@ import numpy as np
 import platformdirs
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-from octoseg_ti.device import tracing
+from octoseg_ti.device import launching, tracing
 
 with tracing.quick_import():
     import taichi as ti
 
 tracing.speed_up(ti.lang.kernel_impl, ti.lang.ast.ast_transformer_utils)
+launching.speed_up(ti)
 
 ARCHS = ("cpu", "cuda", "vulkan", "metal")
 

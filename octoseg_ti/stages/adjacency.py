@@ -86,7 +86,5 @@ def find_touching(grid: Grid) -> Adjacency:
     runtime.ensure_started()
     count = runtime.empty(grid.count, np.int32)
     neighbor = runtime.empty((grid.count, _MOST), np.int32)
-    _find_touching(
-        grid.depth, ti.Vector(grid.shape), grid.node, grid.child, grid.root, count, neighbor
-    )
+    _find_touching(grid.depth, grid.shape, grid.node, grid.child, grid.root, count, neighbor)
     return Adjacency(count=count, neighbor=neighbor)

@@ -299,10 +299,10 @@ def assign_points(
         best = runtime.upload(np.full((len(index), 3), np.inf))
         _join(
             r,
-            ti.Vector([limit, tight, float(np.cos(angle))]),
+            (limit, tight, float(np.cos(angle))),
             2.0**grid.depth / grid.size,
             grid.depth,
-            ti.Vector(grid.shape),
+            grid.shape,
             grid.point,
             grid.child,
             grid.root,

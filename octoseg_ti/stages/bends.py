@@ -10,6 +10,8 @@ gaps of t between them; such a piece has the deviation t / sqrt(12), and its sis
 angle 2 t: a ratio of 0.14.
 """
 
+from itertools import combinations_with_replacement
+
 import numpy as np
 
 from octoseg_ti.device import runtime
@@ -231,10 +233,12 @@ def split_at_bends(
         narrow = homogeneity
         for name in straight:
             cells = suspects[name]
-            names, numbered = np.unique(pieces[cells], return_inverse=True)
+            numbered = np.full(len(cells), NONE)
+            left = pieces[cells] >= 0
+            numbered[left] = _numbered(pieces[cells][left])[1]
             normal = mean[cells, NORMAL : NORMAL + 3]
             faces = _flat_faces(
-                numbered - int(names[0] == NONE),
+                numbered,
                 count[cells],
                 normal,
                 noise=noise,
@@ -273,12 +277,16 @@ def split_at_bends(
 
 def _valley(turn: np.ndarray, count: np.ndarray) -> float:
     """Return the limit that parts the turning best into little and much (Otsu's criterion)."""
-    order = np.argsort(turn, kind="stable")
-    weight = np.cumsum(count[order], dtype=np.float64)
-    sums = np.cumsum(count[order] * turn[order])
-    low, high = weight[:-1], weight[-1] - weight[:-1]
-    apart = (sums[:-1] / low - (sums[-1] - sums[:-1]) / high) ** 2 * low * high
-    return float(turn[order[int(np.argmax(apart))]]) if len(apart) else float("inf")
+    order = np.argsort(turn)
+    turn, count = turn[order], count[order].astype(np.float64)
+    weight, sums = np.cumsum(count), np.cumsum(count * turn)
+    cut = np.flatnonzero(turn[1:] > turn[:-1])  # between equal values there is no limit
+    if len(cut) == 0:
+        return float("inf")
+    low, below = weight[cut], sums[cut]
+    high, above = weight[-1] - low, sums[-1] - below
+    apart = (below / low - above / high) ** 2 * low * high
+    return float(turn[cut[int(np.argmax(apart))]])
 
 
 def _suspects(
@@ -286,15 +294,27 @@ def _suspects(
 ) -> dict[int, np.ndarray]:
     """Return the cells of every group that is large and not flat, by the name of the group."""
     inside = np.flatnonzero(group >= 0)
-    names, owner = np.unique(group[inside], return_inverse=True)
-    weight, n = count[inside], normal[inside]
+    names, owner = _numbered(group[inside])
+    weight = count[inside].astype(np.float64)
+    nx, ny, nz = np.ascontiguousarray(normal[inside].T)
     size = np.bincount(owner, weights=weight, minlength=len(names))
     # Axes, not directions: without sides a mean of directions means nothing.
     tensor = np.empty((len(names), 3, 3))
-    for a, b in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
-        sums = np.bincount(owner, weights=weight * n[:, a] * n[:, b], minlength=len(names))
-        tensor[:, a, b] = tensor[:, b, a] = sums / size
+    for (i, a), (j, b) in combinations_with_replacement(enumerate((nx, ny, nz)), 2):
+        sums = np.bincount(owner, weights=weight * a * b, minlength=len(names))
+        tensor[:, i, j] = tensor[:, j, i] = sums / size
     doubtful = (size >= min_points) & (1.0 - np.linalg.eigvalsh(tensor)[:, 2] > flat**2)
-    order = np.argsort(owner, kind="stable")
-    first = np.searchsorted(owner[order], np.arange(len(names) + 1))
-    return {int(names[g]): inside[order[first[g] : first[g + 1]]] for g in np.flatnonzero(doubtful)}
+    asked = np.flatnonzero(doubtful[owner])
+    order = asked[np.argsort(owner[asked], kind="stable")]
+    ends = np.cumsum(np.bincount(owner[asked], minlength=len(names)))
+    return {
+        int(names[g]): inside[order[ends[g - 1] if g else 0 : ends[g]]]
+        for g in np.flatnonzero(doubtful)
+    }
+
+
+def _numbered(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the different names, ascending, and the place of every name among them."""
+    there = np.zeros(int(names.max(initial=-1)) + 1, bool)
+    there[names] = True
+    return np.flatnonzero(there), (np.cumsum(there) - 1)[names]

@@ -390,9 +390,7 @@ def build_grid(
     rows = max(2 * count, n // 8)  # a guess, so that the tables seldom have to grow
     node = runtime.empty((rows, 7), np.int32)
     root = runtime.upload(np.full(shape[0] * shape[1] * shape[2], -1, np.int32))
-    _emit_heads(
-        n, workers, stride, 3 * depth, ti.Vector(shape), key, runtime.upload(place), node, root
-    )
+    _emit_heads(n, workers, stride, 3 * depth, shape, key, runtime.upload(place), node, root)
 
     child = runtime.empty((rows, 8), np.int32)
     mean = runtime.empty((rows, 8), np.float64)
@@ -410,8 +408,8 @@ def build_grid(
         bound = runtime.empty((count - first, 9), np.int32)
         residual = flatness * tolerance * cell + 3.0 * noise
         _decide(
-            ti.Vector([first, count, min_points, halt, 3 * (depth - level - 1), int(signed)]),
-            ti.Vector([tolerance, residual, roughness, cell]),
+            (first, count, min_points, halt, 3 * (depth - level - 1), int(signed)),
+            (tolerance, residual, roughness, cell),
             key, moment, node, mean, daughters, bound,
         )  # fmt: skip
         counts = runtime.download(daughters)

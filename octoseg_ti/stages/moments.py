@@ -161,27 +161,26 @@ def add_up(
     _accumulate(first, last, slices, int(signed), size, node, point, normal, moment)
 
 
-def point_sums(
-    moment: np.ndarray, middle: np.ndarray, size: np.ndarray, about: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def point_sums(moment: np.ndarray, off: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Return count, sum of positions and of their products for cells, measured from given places.
 
     Args:
         moment: Moments of the cells, shape (c, 19), i64.
-        middle: Middle of every cell [mm], shape (c, 3).
+        off: From the place to measure from to the middle of every cell [mm], shape (3, c).
         size: Edge length of every cell [mm], shape (c,).
-        about: The place to measure from, for every cell [mm], shape (c, 3).
 
     Returns:
-        Counts, shape (c,), f64; sums [mm], shape (c, 3); sums of the products xx, xy, xz, yy, yz,
-        zz [mm^2], shape (c, 6).
+        Count, sums x, y, z [mm] and sums of the products xx, xy, xz, yy, yz, zz [mm^2]; shape
+        (10, c), f64.
     """
-    count = moment[:, 0].astype(np.float64)
-    half = 0.5 * size[:, None]
-    first = moment[:, 10:13] * (half / _ONE)
-    second = moment[:, 13:19] * (half**2 / _ONE)
-    off = middle - about
-    a, b = list(_ROW), list(_COLUMN)
-    second = second + off[:, a] * first[:, b] + first[:, a] * off[:, b]
-    second += count[:, None] * off[:, a] * off[:, b]
-    return count, first + count[:, None] * off, second
+    sums = np.empty((10, len(moment)))
+    sums[0] = moment[:, 0]
+    sums[1:] = moment[:, 10:].T
+    half = 0.5 * size
+    sums[1:4] *= half / _ONE
+    sums[4:] *= half**2 / _ONE
+    # Moved: sum (p + d)(p + d)' = sum p p' + d sum p' + sum p d' + n d d'.
+    for k, (a, b) in enumerate(zip(_ROW, _COLUMN, strict=True)):
+        sums[4 + k] += off[a] * (sums[1 + b] + sums[0] * off[b]) + sums[1 + a] * off[b]
+    sums[1:4] += sums[0] * off
+    return sums

@@ -35,30 +35,25 @@ def fit_planes(
     cells, owner = leaves[inside], label[inside]
     if patches == 0:
         return kind, parameters, residual
+    # About a cell of the patch itself: small numbers lose few digits.
     size = grid.edge_length[cells]
-    node = runtime.download(grid.node)[cells, X : Z + 1]
-    moment = runtime.download(grid.moment)[cells]
-    middle = (node + 0.5) * size[:, None]
-
-    def total(values: np.ndarray) -> np.ndarray:
-        columns = [np.bincount(owner, weights=column, minlength=patches) for column in values.T]
-        return np.stack(columns, axis=1)
-
-    count, first, _ = point_sums(moment, middle, size, np.zeros(3))
-    points = np.maximum(np.bincount(owner, weights=count, minlength=patches), 1.0)[:, None]
-    mean = total(first) / points
-    # About the middle of the patch: small numbers lose no digits.
-    _, first, second = point_sums(moment, middle, size, mean[owner])
-    rest = total(first) / points
-    product = total(second) / points
+    middle = (runtime.download(grid.node)[cells, X : Z + 1].T + 0.5) * size
+    some = np.zeros(patches, np.int64)
+    some[owner] = np.arange(len(owner))
+    anchor = middle[:, some] if len(cells) else np.zeros((3, patches))
+    sums = point_sums(runtime.download(grid.moment)[cells], middle - anchor[:, owner], size)
+    total = np.stack([np.bincount(owner, weights=row, minlength=patches) for row in sums])
+    mean, product = total[1:4].T, total[4:].T
+    points = np.maximum(total[0], 1.0)[:, None]
+    mean, product = mean / points, product / points
     a, b = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
     covariance = np.empty((patches, 3, 3))
-    covariance[:, a, b] = covariance[:, b, a] = product - rest[:, a] * rest[:, b]
+    covariance[:, a, b] = covariance[:, b, a] = product - mean[:, a] * mean[:, b]
     value, vector = np.linalg.eigh(covariance)
     rms = np.sqrt(np.maximum(value[:, 0], 0.0))
     flat = rms <= limit
     kind[flat] = int(SurfaceKind.PLANE)
-    parameters[flat, :3] = (mean + rest + grid.corner)[flat]
+    parameters[flat, :3] = (anchor.T + mean + grid.corner)[flat]
     parameters[flat, 3:6] = vector[flat, :, 0]
     residual[flat] = rms[flat]
     return kind, parameters, residual
