@@ -105,17 +105,16 @@ def _numbers(name: str, value: np.ndarray | None, n: int) -> np.ndarray | None:
     return np.ascontiguousarray(array, np.int32)
 
 
-def arrange(scans: Scans, drop: np.ndarray | None = None) -> Arranged:
-    """Return the finite points that are not dropped, stripe after stripe.
+def arrange(scans: Scans) -> Arranged:
+    """Return the finite points, stripe after stripe.
 
     Args:
         scans: Checked scans.
-        drop: Rows to leave out, shape (N,), bool.
 
     Raises:
         DataError: Fewer than three usable points, or a single stripe.
     """
-    usable = np.ones(len(scans.points), bool) if drop is None else ~drop
+    usable = np.ones(len(scans.points), bool)
     for rows in (scans.points, scans.normals):
         # A sum is finite only if all numbers are; that says it for most inputs at once.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -124,12 +123,10 @@ def arrange(scans: Scans, drop: np.ndarray | None = None) -> Arranged:
             usable &= np.isfinite(rows).all(axis=1)
     whole = bool(usable.all())
     row = np.arange(len(usable)) if whole else np.flatnonzero(usable)
-    if len(row) < 3:
-        raise DataError(
-            f"{len(row)} of {len(usable)} points can be used, a segmentation needs at least 3",
-            hint="check for NaN rows" if len(usable) > 2 else "",
-        )
-    view = np.zeros(len(row), np.int32) if scans.view is None else scans.view[row]
+    _need_three(len(row), len(usable))
+    view = np.zeros(len(row), np.int32)
+    if scans.view is not None:
+        view = scans.view if whole else scans.view[row]
     if scans.stripe is None:
         return _arranged(scans, row, view, None, None, whole)
     stripe = scans.stripe if whole else scans.stripe[row]
@@ -146,13 +143,57 @@ def arrange(scans: Scans, drop: np.ndarray | None = None) -> Arranged:
     if scans.view is not None:
         new[1:] |= view[1:] != view[:-1]
     first = np.flatnonzero(new)
-    if len(first) < 2:
+    _need_two(len(first))
+    start = np.append(first, len(row)).astype(np.int32)
+    return _arranged(scans, row, view, np.cumsum(new, dtype=np.int32) - np.int32(1), start, whole)
+
+
+def without(arranged: Arranged, marked: np.ndarray, rows: int) -> Arranged:
+    """Return the points that are not marked.
+
+    Args:
+        arranged: Points on stripes.
+        marked: Which of them to leave out, shape (n,), bool.
+        rows: Number of rows of the input.
+
+    Raises:
+        DataError: Fewer than three points are left, or a single stripe.
+    """
+    assert arranged.run is not None and arranged.start is not None
+    kept = np.flatnonzero(~marked)
+    _need_three(len(kept), rows)
+    counts = np.diff(arranged.start) - np.bincount(
+        arranged.run[marked], minlength=len(arranged.start) - 1
+    )
+    there = counts > 0
+    _need_two(int(there.sum()))
+    number = np.cumsum(there, dtype=np.int32) - np.int32(1)
+    run = arranged.run[kept]
+    return Arranged(
+        row=arranged.row[kept],
+        points=arranged.points.take(kept, axis=0),
+        normals=None if arranged.normals is None else arranged.normals.take(kept, axis=0),
+        view=arranged.view[kept],
+        run=run if there.all() else number[run],
+        start=np.concatenate([[0], np.cumsum(counts[there])]).astype(np.int32),
+        whole=False,
+    )
+
+
+def _need_three(points: int, rows: int) -> None:
+    if points < 3:
+        raise DataError(
+            f"{points} of {rows} points can be used, a segmentation needs at least 3",
+            hint="check for NaN rows" if rows > 2 else "",
+        )
+
+
+def _need_two(stripes: int) -> None:
+    if stripes < 2:
         raise DataError(
             "all points lie on one stripe, a surface needs two",
             hint="leave the stripe numbers out to treat the points as unorganised",
         )
-    start = np.append(first, len(row)).astype(np.int32)
-    return _arranged(scans, row, view, np.cumsum(new, dtype=np.int32) - np.int32(1), start, whole)
 
 
 def _arranged(

@@ -130,7 +130,7 @@ def assemble(
     """Number the patches by size, find the planes, and bring all into the input order."""
     node = runtime.download(grid.node)[: grid.count]
     patches = int(cell_label.max(initial=NONE)) + 1
-    size = np.bincount(label[label >= 0], minlength=patches)
+    size = np.bincount(label + 1, minlength=patches + 1)[1:]
     rank = np.argsort(-size, kind="stable")
     name = np.full(patches + 1, NONE, np.int32)
     name[rank] = np.arange(patches, dtype=np.int32)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from octoseg_ti.arrange import Arranged, arrange, as_scans
+from octoseg_ti.arrange import Arranged, arrange, as_scans, without
 from octoseg_ti.defaults import derive
 from octoseg_ti.device import runtime
 from octoseg_ti.device.profiling import Trace
@@ -125,9 +125,7 @@ def clean(scans: Scans, params: Params) -> tuple[Arranged, Measurement, Params]:
             isolation=params.cleaning.isolation,
         )
         if marked.any():
-            drop = np.zeros(len(scans), bool)
-            drop[arranged.row[marked > 0]] = True
-            arranged = arrange(scans, drop)
+            arranged = without(arranged, marked > 0, len(scans))
     return arranged, measured, params
 
 

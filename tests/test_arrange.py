@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from octoseg_ti.arrange import arrange, as_scans
+from octoseg_ti.arrange import arrange, as_scans, without
 from octoseg_ti.errors import DataError
 from octoseg_ti.types import Scans
 
@@ -70,10 +70,32 @@ def test_rows_without_a_finite_normal_are_left_out() -> None:
     assert arrange(as_scans(POINTS, normals=normals)).row.tolist() == [*range(3), *range(4, 12)]
 
 
-def test_dropped_rows_are_left_out() -> None:
-    drop = np.zeros(12, bool)
-    drop[[0, 7]] = True
-    assert arrange(as_scans(POINTS), drop).row.tolist() == [1, 2, 3, 4, 5, 6, 8, 9, 10, 11]
+@pytest.mark.parametrize("seed", range(20))
+def test_without_marked_points_is_as_if_they_had_never_been_there(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(30, 80))
+    points, normals = rng.random((n, 3)), rng.random((n, 3)) + 0.1
+    view = rng.integers(0, 2, n)
+    stripe = rng.integers(0, 6, n)
+    scans = as_scans(points, normals=normals, stripe=stripe, view=view)
+    arranged = arrange(scans)
+    marked = rng.random(n) < rng.choice([0.05, 0.5, 0.8])
+    if seed % 3 == 0:
+        marked |= arranged.run == 2  # a whole stripe
+    left = np.ones(n, bool)
+    left[arranged.row[marked]] = False
+    got = without(arranged, marked, n)
+    rows = np.flatnonzero(left)
+    expected = arrange(
+        as_scans(points[rows], normals=normals[rows], stripe=stripe[rows], view=view[rows])
+    )
+    np.testing.assert_array_equal(got.row, rows[expected.row])
+    for name in ("points", "normals", "view", "run", "start"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(expected, name), err_msg=name)
+    assert not got.whole
+    for few in (np.ones(n, bool), arranged.run > 0):
+        with pytest.raises(DataError, match=r"needs (at least 3|two)"):
+            without(arranged, few, n)
 
 
 LONG = np.arange(12)

@@ -200,9 +200,6 @@ def to_rows(
     )
     placed = runtime.empty((rows, 3), np.float64)
     turned = runtime.empty((rows, 3), np.float32)
-    if not whole:
-        placed = runtime.upload(np.full((rows, 3), np.nan))
-        turned = runtime.upload(np.zeros((rows, 3), np.float32))
     _scatter(
         grid.order,
         runtime.upload(row.astype(np.int32)),
@@ -217,9 +214,14 @@ def to_rows(
         placed,
         turned,
     )
+    position, normal = runtime.download(placed), runtime.download(turned)
+    if not whole:
+        left_out = np.ones(rows, bool)
+        left_out[row] = False
+        position[left_out], normal[left_out] = np.nan, 0.0
     return Rows(
-        points=runtime.download(placed),
-        normals=runtime.download(turned),
+        points=position,
+        normals=normal,
         labels=runtime.download(labels),
         level=runtime.download(levels).astype(np.int8),
         edge=runtime.download(edges).astype(np.uint8),
