@@ -67,7 +67,7 @@ def _source_lines(thorough: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
     @functools.cache
     def lines_of(function: Any) -> tuple[list[str], int]:
-        code = getattr(function, "__code__", None)
+        code: Any = getattr(function, "__code__", None)
         lines = linecache.getlines(code.co_filename) if code is not None else []
         if not lines or code.co_firstlineno > len(lines):
             return thorough(function)  # type: ignore[no-any-return]
