@@ -230,7 +230,7 @@ def test_a_bug_is_called_a_bug(
     def broken(*_args: object, **_options: object) -> None:
         raise KeyError("no such thing")
 
-    monkeypatch.setattr(files, "read", broken)
+    monkeypatch.setattr(files, "read_with_truth", broken)
     outcome = octoseg("segment", recording, "-o", tmp_path / "out.npz")
     assert outcome.code == 1
     assert "this is a bug" in outcome.err
