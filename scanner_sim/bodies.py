@@ -10,7 +10,6 @@ import numpy as np
 from scanner_sim.bases import Body, Corner, Deck, drawn_body
 from scanner_sim.features import SHARP, block_shape
 
-
 if TYPE_CHECKING:
     from scanner_sim.draw import Draw
 
@@ -84,9 +83,7 @@ def _slopes(draw: Draw, length: float) -> list[Corner]:
     drops = [(left + half) * falls[0], (half - right) * falls[1]]
     high = _LEAST_HEIGHT - 2.0 + max(drops) + draw.number(0.0, 6.0)
     # A blend over so small an angle needs a large radius to be wide enough.
-    rounds = [
-        draw.number(2.5 / math.radians(angle), 12.0) if smooth else 0.0 for angle in angles
-    ]
+    rounds = [draw.number(2.5 / math.radians(angle), 12.0) if smooth else 0.0 for angle in angles]
     corners = [Corner(-half, 0.0), Corner(-half, round(high - drops[0], 2) if both else high)]
     if both:
         corners.append(Corner(left, high, rounds[0]))

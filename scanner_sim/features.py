@@ -254,9 +254,7 @@ def _column(radius: float, lean: float, height: float) -> Part:
         flank, half_space((0, 0, -ROOT), (0, 0, -1)), half_space((0, 0, height), (0, 0, 1))
     )
     wide = radius + ROOT * tan
-    return dataclasses.replace(
-        solid, box=np.array([[-wide, -wide, -ROOT], [wide, wide, height]])
-    )
+    return dataclasses.replace(solid, box=np.array([[-wide, -wide, -ROOT], [wide, wide, height]]))
 
 
 def _round_foot(radius: float, lean: float, foot: Rim) -> tuple[list[Part], float]:

@@ -172,9 +172,7 @@ def _pocket(draw: Draw) -> Feature:
     return Feature("pocket", shape, is_cut=True, turns=True)
 
 
-def _block_rims(
-    draw: Draw, half: tuple[float, float], height: float
-) -> tuple[float, Rim, Rim]:
+def _block_rims(draw: Draw, half: tuple[float, float], height: float) -> tuple[float, Rim, Rim]:
     """Return the corner radius and the finish of end and foot, as `block_shape` wants them."""
     least, room = min(half), height - _WALL
     end = draw.rim(min(room, least - WIDE), blend=min(room, least - WIDE))

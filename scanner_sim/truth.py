@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from octoseg_ti.types import NONE, EdgeClass, Truth
-from scanner_sim.edges import nearest_edge, trace_edges
+from scanner_sim.edges import trace_edges
+from scanner_sim.nearest import nearest_edge
 from scanner_sim.quadric import distance, gradient
 from scanner_sim.raycast import classify
 
