@@ -17,8 +17,8 @@ import numpy as np
 from octoseg_ti.types import EdgeClass, SurfaceKind
 from scanner_sim.charts import Chart, corners, make_chart
 from scanner_sim.nearest import Edges
-from scanner_sim.quadric import distance, gradient
-from scanner_sim.raycast import classify
+from scanner_sim.faces import passing, side_near
+from scanner_sim.quadric import gradient
 
 if TYPE_CHECKING:
     from scanner_sim.part import FlatPart
@@ -204,9 +204,9 @@ def _kinds(part: FlatPart, surface: np.ndarray, start: np.ndarray, end: np.ndarr
     run /= np.maximum(np.linalg.norm(run, axis=1, keepdims=True), 1e-30)
     middle = 0.5 * (start + end)
     normal = gradient(surfaces, surface, middle)
-    normal *= _side_near(part, surface, middle, run)[:, None]
-    near, other = _passing(part, surface, start, middle, end)
-    side = _side_near(part, other, middle[near], run[near])
+    normal *= side_near(part, surface, middle, run, _PROBE)[:, None]
+    near, other = passing(part, surface, (start, end), _TOUCH, 2.0 * _DEVIATION)
+    side = side_near(part, other, middle[near], run[near], _PROBE)
     near, other, side = near[side != 0], other[side != 0], side[side != 0]
     neighbour = gradient(surfaces, other, middle[near]) * side[:, None]
     cosine = np.einsum("ij,ij->i", normal[near], neighbour)
@@ -221,42 +221,3 @@ def _kinds(part: FlatPart, surface: np.ndarray, start: np.ndarray, end: np.ndarr
     kind = np.full(len(start), EdgeClass.NONE, np.uint8)
     kind[near[order]] = found[order]
     return kind
-
-
-def _passing(
-    part: FlatPart, surface: np.ndarray, start: np.ndarray, middle: np.ndarray, end: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return chords, and for each the other surfaces that pass through an end and the middle."""
-    near, other = [], []
-    for s, limits in enumerate(part.surface_boxes):
-        close = ((middle >= limits[0] - _PROBE) & (middle <= limits[1] + _PROBE)).all(axis=1)
-        chosen = np.flatnonzero(close & (surface != s))
-        index = np.full(len(chosen), s, np.int32)
-        gaps = [np.abs(distance(part.surfaces, index, p[chosen])) for p in (start, middle, end)]
-        chosen = chosen[(np.minimum(gaps[0], gaps[2]) < _TOUCH) & (gaps[1] < 2.0 * _DEVIATION)]
-        near.append(chosen)
-        other.append(np.full(len(chosen), s, np.int32))
-    return np.concatenate(near), np.concatenate(other)
-
-
-def _side_near(
-    part: FlatPart, surface: np.ndarray, point: np.ndarray, run: np.ndarray
-) -> np.ndarray:
-    """Return on which side of its surface the part lies, close to a point of an edge; 0 = none.
-
-    Args:
-        part: The solid.
-        surface: Surface of every point, shape (N,).
-        point: Points on it [mm], shape (N, 3).
-        run: Direction of the edge, shape (N, 3).
-    """
-    across = np.cross(run, gradient(part.surfaces, surface, point))
-    side = np.zeros(len(point), np.int32)
-    for sign in (-_PROBE, _PROBE):
-        probe = point + sign * across
-        for _ in range(2):
-            step = distance(part.surfaces, surface, probe)
-            probe -= step[:, None] * gradient(part.surfaces, surface, probe)
-        there = classify(part, probe, surface)
-        side = np.where(side == 0, there, side)
-    return side
