@@ -28,7 +28,7 @@ class Deck(NamedTuple):
     """A rectangle of a body's surface on which features may stand."""
 
     place: np.ndarray
-    """Maps the deck's frame (x along the outline, y across it, z outwards) to the body's, (4, 4)."""
+    """Maps the frame of the deck (x along the outline, z outwards) to that of the body, (4, 4)."""
     half: tuple[float, float]
     """Half of its size along x and y [mm]."""
     rise: tuple[float, float]

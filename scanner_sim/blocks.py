@@ -1,4 +1,4 @@
-"""The parts by name: random blocks, and test parts after the examples of Woo et al. 2002, section 4.
+"""The parts by name: random blocks, and three after the examples of Woo et al. 2002, section 4.
 
 The paper gives sizes, point counts and the number of patches; the shapes are ours. Every joint of
 two patches is either an edge of 20 degrees or more, or a fillet, which belongs to no patch.

@@ -107,19 +107,15 @@ def _bends(draw: Draw, length: float) -> list[Corner]:
 
 def _finished_ends(draw: Draw, outline: list[Corner]) -> list[Corner]:
     """Return the outline with its two upper end corners finished."""
-    first, last = outline[1], outline[-2]
-    return [
-        outline[0], *_finished(draw, first, 1.0), *outline[2:-2],
-        *reversed(_finished(draw, last, -1.0)), outline[-1],
-    ]  # fmt: skip
+    ends = _finished(draw, outline[1], outline[2]), _finished(draw, outline[-2], outline[-3])
+    return [outline[0], *ends[0], *outline[2:-2], *reversed(ends[1]), outline[-1]]
 
 
-def _finished(draw: Draw, corner: Corner, inwards: float) -> list[Corner]:
+def _finished(draw: Draw, corner: Corner, inner: Corner) -> list[Corner]:
+    """Return what replaces an upper end corner; a chamfer has equal legs along the end and in x."""
     rim = draw.rim(3.0, blend=6.0)
     if rim.chamfer:
-        # Only on level tops: there the chamfer has the 45 degrees of all others.
-        return [
-            Corner(corner.x, corner.z - rim.chamfer),
-            Corner(corner.x + inwards * rim.chamfer, corner.z),
-        ]
+        share = rim.chamfer / abs(inner.x - corner.x)
+        x, z = ((1.0 - share) * a + share * b for a, b in zip(corner[:2], inner[:2], strict=True))
+        return [Corner(corner.x, corner.z - rim.chamfer), Corner(x, z)]
     return [Corner(corner.x, corner.z, rim.round)]

@@ -16,8 +16,8 @@ import numpy as np
 
 from octoseg_ti.types import EdgeClass, SurfaceKind
 from scanner_sim.charts import Chart, corners, make_chart
-from scanner_sim.nearest import Edges
 from scanner_sim.faces import passing, side_near
+from scanner_sim.nearest import Edges
 from scanner_sim.quadric import gradient
 
 if TYPE_CHECKING:

@@ -83,7 +83,7 @@ def random_block(seed: int, family: str = "mixed") -> Part:
         family: "sharp", "filleted", "smooth" or "mixed".
 
     Raises:
-        DataError: The seed is negative, or there is no such family.
+        DataError: The seed is negative or too large, or there is no such family.
     """
     return _build(seed, family)[0]
 
@@ -92,7 +92,7 @@ def describe_block(seed: int, family: str = "mixed") -> tuple[BlockPart, ...]:
     """Return what `random_block` put together: the body first, then its features.
 
     Raises:
-        DataError: The seed is negative, or there is no such family.
+        DataError: The seed is negative or too large, or there is no such family.
     """
     return _build(seed, family)[1]
 
@@ -106,9 +106,9 @@ def parse_name(name: str) -> tuple[int, str]:
     words = name.split(":")
     if words[0] != "random" or not 2 <= len(words) <= 3:
         raise DataError(f"{name!r} names no random block", hint="write random:SEED[:FAMILY]")
-    if not (words[1].isascii() and words[1].isdigit()):
+    if not (words[1].isascii() and words[1].isdigit() and len(words[1]) <= 20):
         raise DataError(
-            f"the seed of a random block is a whole number of 0 or more, not {words[1]!r}",
+            f"the seed of a random block is a whole number from 0 to 2^64 - 1, not {words[1]!r}",
             hint="for example random:17",
         )
     family = words[2] if len(words) == 3 else "mixed"
@@ -126,8 +126,8 @@ def _check_family(family: str) -> None:
 
 def _build(seed: int, family: str) -> tuple[Part, tuple[BlockPart, ...]]:
     _check_family(family)
-    if seed < 0:
-        raise DataError(f"the seed of a random block is a whole number of 0 or more, not {seed}")
+    if not 0 <= seed < 2**64:
+        raise DataError(f"the seed of a random block must be at least 0 and below 2^64, not {seed}")
     # Families are independent, and so are what is drawn for the body and for the features.
     root = np.random.SeedSequence(seed, spawn_key=(FAMILIES.index(family),))
     draws = [Draw(np.random.default_rng(child), family) for child in root.spawn(2)]

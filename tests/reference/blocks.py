@@ -1,11 +1,11 @@
-"""Plain NumPy answers about parts, for many rays and points at once; no tree of boxes, no kernels."""
+"""Plain NumPy answers about parts, for many rays at once: no boxes around solids, no kernels."""
 
 from __future__ import annotations
 
 import numpy as np
-from reference.rays import implicit, leaves
 
 from octoseg_ti.types import SurfaceKind
+from reference.rays import implicit, leaves
 from scanner_sim.part import Op, Part
 from scanner_sim.quadric import Surface
 
