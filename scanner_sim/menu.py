@@ -1,7 +1,7 @@
 """The features of random blocks, with random sizes that leave every patch wide enough to be seen.
 
 Lengths in mm. The limits that are drawn from say what has to remain: a flat end of `WIDE`, a wall
-of `_WALL` between the finish of its foot and that of its end, the part of a hole's wall that is in
+of `WALL` between the finish of its foot and that of its end, the part of a hole's wall that is in
 sight.
 """
 
@@ -26,7 +26,9 @@ from scanner_sim.features import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-_WALL = 2.5  # of walls is left at least this height [mm]
+WALL = 2.5
+"""Of walls is left at least this height [mm]."""
+
 _THROUGH = 60.0  # longer than any body is thick [mm]
 
 
@@ -77,7 +79,7 @@ def _bored_boss(draw: Draw) -> Feature:
 
 def _round_rims(draw: Draw, radius: float, height: float, flat: float = WIDE) -> tuple[Rim, Rim]:
     """Return the finish of end and foot of a round boss; chamfers are not for feet."""
-    room = height - _WALL
+    room = height - WALL
     # The ring of a torus has to be wider than its tube.
     end = draw.rim(min(room, radius - flat, 0.45 * radius), blend=min(room, 0.45 * radius))
     if radius - end.reach < flat:
@@ -91,8 +93,8 @@ def _conical_boss(draw: Draw) -> Feature:
     height = draw.number(4.5, 8.0)
     radius = draw.number(4.0, 6.5) + height * math.tan(lean)
     top = radius - height * math.tan(lean)
-    end = draw.rim(min(height - _WALL, 0.45 * top, top - WIDE))
-    foot = draw.rim(height - _WALL - end.reach)
+    end = draw.rim(min(height - WALL, 0.45 * top, top - WIDE))
+    foot = draw.rim(height - WALL - end.reach)
     end, foot = (SHARP if rim.chamfer else rim for rim in (end, foot))
     return Feature("conical boss", round_shape(radius, height, lean=lean, end=end, foot=foot))
 
@@ -116,7 +118,7 @@ def _dimple(draw: Draw) -> Feature:
 
 def _pin(draw: Draw) -> Feature:
     radius, height = draw.number(3.5, 6.5), draw.number(3.0, 7.0)
-    foot = draw.rim(height - _WALL, blend=height - _WALL)
+    foot = draw.rim(height - WALL, blend=height - WALL)
     return Feature("capped pin", pin_shape(radius, height, foot=SHARP if foot.chamfer else foot))
 
 
@@ -130,8 +132,8 @@ def _blind_hole(draw: Draw) -> Feature:
 
 def _hole_rims(draw: Draw, half: float, depth: float) -> tuple[Rim, Rim]:
     """Return the finish of floor and rim of a hole or pocket, half of whose width is given."""
-    rim = draw.rim(min(depth - _WALL, SIGHT * half - WIDE), blend=depth - _WALL)
-    floor = draw.rim(min(depth - rim.reach - _WALL, 0.4 * half))
+    rim = draw.rim(min(depth - WALL, SIGHT * half - WIDE), blend=depth - WALL)
+    floor = draw.rim(min(depth - rim.reach - WALL, 0.4 * half))
     return SHARP if floor.chamfer else floor, rim
 
 
@@ -174,7 +176,7 @@ def _pocket(draw: Draw) -> Feature:
 
 def _block_rims(draw: Draw, half: tuple[float, float], height: float) -> tuple[float, Rim, Rim]:
     """Return the corner radius and the finish of end and foot, as `block_shape` wants them."""
-    least, room = min(half), height - _WALL
+    least, room = min(half), height - WALL
     end = draw.rim(min(room, least - WIDE), blend=min(room, least - WIDE))
     if end.chamfer:
         return 0.0, end, SHARP
@@ -183,7 +185,10 @@ def _block_rims(draw: Draw, half: tuple[float, float], height: float) -> tuple[f
         return end.round, end, foot if foot.round else SHARP
     if draw.family == "sharp" or draw.chance(0.3):
         return 0.0, SHARP, SHARP
-    corner = draw.number(4.0, least - 1.0) if draw.family == "smooth" else draw.number(1.5, 3.0)
+    # Between round corners is left a wall that is wide enough, and more so since it is low.
+    corner = draw.number(1.5, 3.0)
+    if draw.family == "smooth":
+        corner = draw.number(FILLET_LIMIT + 0.2, least - 0.8 * WIDE)
     foot = draw.rim(room)
     return corner, SHARP, foot if foot.round else SHARP
 
@@ -194,7 +199,7 @@ def _rib(draw: Draw) -> Feature:
     rim = draw.rim(half[1] - 0.5 * WIDE - 0.25)
     if not rim.round:
         return Feature("rib", block_shape(half, height), turns=True)
-    foot = draw.rim(min(height - rim.round - _WALL, 2.0))
+    foot = draw.rim(min(height - rim.round - WALL, 2.0))
     foot = foot if foot.round else SHARP
     shape = block_shape(half, height, corner=rim.round, end=rim, foot=foot)
     return Feature("rib", shape, turns=True)
@@ -204,8 +209,8 @@ def _slot(draw: Draw) -> Feature:
     # The round ends are wider than a fillet: they are patches.
     b = draw.number(FILLET_LIMIT + 0.2, 5.0)
     half, depth = (b + draw.number(4.0, 12.0), b), draw.number(3.0, 5.0)
-    rim = draw.rim(min(depth - _WALL, SIGHT * b - WIDE))
-    floor = draw.rim(min(depth - rim.round - _WALL, 0.4 * b, b - WIDE))
+    rim = draw.rim(min(depth - WALL, SIGHT * b - WIDE))
+    floor = draw.rim(min(depth - rim.round - WALL, 0.4 * b, b - WIDE))
     rim, floor = (r if r.round else SHARP for r in (rim, floor))
     shape = block_shape(half, depth, corner=b, end=floor, foot=rim)
     return Feature("slot", shape, is_cut=True, turns=True)

@@ -27,7 +27,7 @@ from octoseg_ti.errors import DataError
 from scanner_sim.bodies import random_body
 from scanner_sim.draw import FAMILIES, SIGHT, WIDE, Draw
 from scanner_sim.features import Shape, upside_down
-from scanner_sim.menu import Feature, random_feature
+from scanner_sim.menu import WALL, Feature, random_feature
 from scanner_sim.part import Part, difference, union
 from scanner_sim.scanner import View, around
 
@@ -206,6 +206,9 @@ def _clear_of_step(feature: Feature, height: float, rise: float) -> float:
     # Seen from aside, a boss must leave the upper part of the step's wall free; and the step must
     # not hide what is cut into the deck.
     aside = (height - rise + WIDE) / _GLANCE
+    if feature.turns and not feature.is_cut:
+        # Nor may the step hide the whole of a flat wall that faces it.
+        aside = max(aside, (rise - WALL + WIDE) / _GLANCE)
     return _MARGIN + max(_SHADOW * max(height, rise), aside)
 
 
