@@ -9,7 +9,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, ti
 from octoseg_ti.types import EdgeClass
 
-_BOX = 6.0  # pieces of edges are put together in cubes of this size [mm]
+_BOX = 10.0  # pieces of edges are put together in cubes of this size [mm]
 
 
 class Edges(NamedTuple):
