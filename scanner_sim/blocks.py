@@ -1,4 +1,4 @@
-"""The named test parts, after the three examples of Woo et al. 2002, section 4.
+"""The parts by name: random blocks, and three after the examples of Woo et al. 2002, section 4.
 
 The paper gives sizes, point counts and the number of patches; the shapes are ours. Every joint of
 two patches is either an edge of 20 degrees or more, or a fillet, which belongs to no patch.
@@ -24,10 +24,21 @@ from scanner_sim.part import (
     torus,
     union,
 )
+from scanner_sim.random_blocks import describe_block, parse_name, random_block
 from scanner_sim.scanner import View, around
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+__all__ = [
+    "PARTS",
+    "by_name",
+    "describe_block",
+    "phone",
+    "random_block",
+    "test_block",
+    "two_planes",
+]
 
 _SIDES = (View(azimuth=math.radians(70.0)), *around((math.radians(62.5), 4)))
 """From above, with stripes that run askew of the part, and so steeply from four sides that the top
@@ -208,15 +219,18 @@ PARTS: dict[str, Callable[[], Part]] = {
     "test-block": test_block,
     "phone": phone,
 }
-"""The parts by their names on the command line."""
+"""The parts by their names on the command line; random blocks are named by `parse_name`."""
 
 
 def by_name(name: str) -> Part:
-    """Return a named part.
+    """Return a named part: one of `PARTS`, ``random:SEED`` or ``random:SEED:FAMILY``.
 
     Raises:
         DataError: There is no part of that name; the message lists the names.
     """
+    if name.partition(":")[0] == "random":
+        return random_block(*parse_name(name))
     if name not in PARTS:
-        raise DataError(f"there is no part {name!r}", hint=f"known parts: {', '.join(PARTS)}")
+        known = ", ".join([*PARTS, "random:SEED[:FAMILY]"])
+        raise DataError(f"there is no part {name!r}", hint=f"known parts: {known}")
     return PARTS[name]()

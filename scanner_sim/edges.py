@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from octoseg_ti.types import EdgeClass, SurfaceKind
-from scanner_sim.quadric import distance, frames, gradient
-from scanner_sim.raycast import classify
+from scanner_sim.charts import Chart, corners, make_chart
+from scanner_sim.faces import passing, side_near
+from scanner_sim.nearest import Edges
+from scanner_sim.quadric import gradient
 
 if TYPE_CHECKING:
     from scanner_sim.part import FlatPart
@@ -29,35 +31,9 @@ _SPLITS = 9
 _ASIDE = (0.6, 1.2)
 """How far beside a chord its edge is looked for, in lengths of the chord: a corner of 53 degrees
 is as far away as the chord is long."""
-_HALVINGS = 18  # from a cell's size to some nanometres
 _PROBE = 0.02  # the neighbour of a face is looked for this far from the edge [mm]
 _TOUCH = 1e-5  # a surface this close to a point of an edge passes through it [mm]
-_SAMPLE = 0.04  # spacing of the places by which the nearest edge is looked up [mm]
 _SMOOTH = math.radians(5.0)  # faces that meet at a smaller angle meet smoothly
-
-
-class Edges(NamedTuple):
-    """The edges of a part as short straight pieces; ``E`` pieces."""
-
-    start: np.ndarray
-    """One end [mm], shape (E, 3)."""
-    end: np.ndarray
-    """Other end [mm], shape (E, 3)."""
-    kind: np.ndarray
-    """`EdgeClass`: SHARP, FILLET where a patch runs into a fillet, SMOOTH where two patches meet
-    without an angle, shape (E,), u8."""
-
-
-class _Chart(NamedTuple):
-    """Parameters (u, v) of all surfaces, scaled so that a unit is about a millimetre."""
-
-    part: FlatPart
-    first: np.ndarray
-    """Direction from which angles count, or of u, shape (S, 3)."""
-    second: np.ndarray
-    """Direction of a quarter turn, or of v, shape (S, 3)."""
-    scale: np.ndarray
-    """Millimetres per unit of u and v, at the widest place, shape (S, 2)."""
 
 
 class _Chords(NamedTuple):
@@ -70,106 +46,18 @@ class _Chords(NamedTuple):
 
 def trace_edges(part: FlatPart) -> Edges:
     """Return all edges of a solid, hidden ones too, to about 0.002 mm."""
-    chart = _chart(part)
+    chart = make_chart(part)
     surface, inner, outer, first, second = _border(chart)
-    place = _halve(chart, surface, inner, outer)
+    place = chart.ends(surface, inner, outer)
     chords = _follow(chart, _Chords(surface[first], place[first], place[second]))
-    start = _points(chart, chords.surface, chords.first)
-    end = _points(chart, chords.surface, chords.second)
+    start = chart.points(chords.surface, chords.first)
+    end = chart.points(chords.surface, chords.second)
     kind = _kinds(part, chords.surface, start, end)
     kept = kind != EdgeClass.NONE
     return Edges(start[kept], end[kept], kind[kept])
 
 
-def nearest_edge(edges: Edges, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance to the nearest edge [mm] and its class for every point.
-
-    Args:
-        edges: The edges; with none of them every distance is infinite.
-        points: Positions [mm], shape (N, 3).
-
-    Returns:
-        Distances, shape (N,), f64; classes (`EdgeClass`), shape (N,), u8.
-    """
-    from scipy.spatial import cKDTree
-
-    if len(edges.kind) == 0:
-        return np.full(len(points), math.inf), np.full(len(points), EdgeClass.NONE, np.uint8)
-    span = edges.end - edges.start
-    # The nearest of dense samples names the piece to measure to; two of them, because around a
-    # corner the nearest sample may lie on the wrong side.
-    counts = np.ceil(np.linalg.norm(span, axis=1) / _SAMPLE).astype(np.int64).clip(1)
-    owner = np.repeat(np.arange(len(span)), counts)
-    place = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    share = (place + 0.5) / counts[owner]
-    tree = cKDTree(edges.start[owner] + share[:, None] * span[owner])
-    count = min(2, len(owner))
-    candidates = owner[tree.query(points, k=count, workers=-1)[1].reshape(len(points), count)]
-    best = np.full(len(points), math.inf)
-    kind = np.zeros(len(points), np.uint8)
-    squared = np.maximum(np.einsum("ij,ij->i", span, span), 1e-30)
-    for k in range(count):
-        piece = candidates[:, k]
-        offset = points - edges.start[piece]
-        along = np.einsum("ij,ij->i", offset, span[piece]) / squared[piece]
-        offset -= np.clip(along, 0.0, 1.0)[:, None] * span[piece]
-        far = np.sqrt(np.einsum("ij,ij->i", offset, offset))
-        nearer = far < best
-        best[nearer], kind[nearer] = far[nearer], edges.kind[piece[nearer]]
-    return best, kind
-
-
-def _chart(part: FlatPart) -> _Chart:
-    """Return the parameters of all surfaces of a part."""
-    kind, a, b = part.surfaces.kind, part.surfaces.data[:, 6], part.surfaces.data[:, 7]
-    first, second = frames(part.surfaces)
-    scale = np.ones((len(kind), 2))
-    scale[kind == SurfaceKind.CYLINDER, 0] = a[kind == SurfaceKind.CYLINDER]
-    ball = kind == SurfaceKind.SPHERE
-    scale[ball] = a[ball, None]
-    ring = kind == SurfaceKind.TORUS
-    scale[ring, 0], scale[ring, 1] = (a + b)[ring], b[ring]
-    for s in np.flatnonzero(kind == SurfaceKind.CONE):
-        apex, axis = part.surfaces.data[s, :3], part.surfaces.data[s, 3:6]
-        highest = ((_corners(part.surface_boxes[s]) - apex) @ axis).max()
-        scale[s, 0] = max(highest, _MARGIN) * math.tan(a[s])
-    return _Chart(part, first, second, scale)
-
-
-def _corners(limits: np.ndarray) -> np.ndarray:
-    """Return the corners of a box, shape (8, 3)."""
-    return np.array([[limits[i, 0], limits[j, 1], limits[k, 2]]
-                     for i in (0, 1) for j in (0, 1) for k in (0, 1)])  # fmt: skip
-
-
-def _points(chart: _Chart, index: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return positions [mm], shape (N, 3), from scaled parameters, shape (N, 2).
-
-    u is a coordinate of a plane, else the angle about the axis; v is the other coordinate, the
-    height (cylinder, cone), the latitude (sphere), or the angle about the tube (torus).
-    """
-    kind, data = chart.part.surfaces.kind[index], chart.part.surfaces.data[index]
-    u, v = (place / chart.scale[index]).T
-    a, b = data[:, 6], data[:, 7]
-    kinds = [kind == SurfaceKind.CYLINDER, kind == SurfaceKind.CONE, kind == SurfaceKind.SPHERE]
-    radius = np.select(kinds, [a, v * np.tan(a), a * np.cos(v)], a + b * np.cos(v))
-    height = np.select(kinds, [v, v, a * np.sin(v)], b * np.sin(v))
-    flat = kind == SurfaceKind.PLANE
-    x = np.where(flat, u, radius * np.cos(u))
-    y = np.where(flat, v, radius * np.sin(u))
-    z = np.where(flat, 0.0, height)
-    return (
-        data[:, :3] + x[:, None] * chart.first[index] + y[:, None] * chart.second[index]
-        + z[:, None] * data[:, 3:6]
-    )  # fmt: skip
-
-
-def _side(chart: _Chart, index: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return on which side of its surface the part lies at every place; 0 = on none or on both."""
-    return classify(chart.part, _points(chart, index, place), index)
-
-
-def _grid(chart: _Chart, s: int) -> tuple[np.ndarray, np.ndarray]:
+def _grid(chart: Chart, s: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes in u and in v of the grid on one surface, in scaled parameters.
 
     A full turn ends with the node where it began, so that the last cell closes it.
@@ -177,8 +65,8 @@ def _grid(chart: _Chart, s: int) -> tuple[np.ndarray, np.ndarray]:
     surfaces = chart.part.surfaces
     kind = surfaces.kind[s]
     a, b = surfaces.data[s, 6:8]
-    axes = np.stack([chart.first[s], chart.second[s], surfaces.data[s, 3:6]], axis=1)
-    local = (_corners(chart.part.surface_boxes[s]) - surfaces.data[s, :3]) @ axes
+    axes = np.stack([chart.axes[s, :3], chart.axes[s, 3:6], surfaces.data[s, 3:6]], axis=1)
+    local = (corners(chart.part.surface_boxes[s]) - surfaces.data[s, :3]) @ axes
     low, high = local.min(axis=0) - _MARGIN, local.max(axis=0) + _MARGIN
     turn = 2.0 * math.pi * chart.scale[s]
     if kind == SurfaceKind.PLANE:
@@ -202,7 +90,7 @@ def _grid(chart: _Chart, s: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _border(
-    chart: _Chart,
+    chart: Chart,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the crossings of all grid lines with borders of faces, and the chords between them.
 
@@ -215,7 +103,7 @@ def _border(
     places = [np.stack(np.meshgrid(u, v, indexing="ij"), axis=2) for u, v in grids]
     index = np.repeat(np.arange(len(kinds), dtype=np.int32), [p.size // 2 for p in places])
     flat = np.concatenate([p.reshape(-1, 2) for p in places])
-    status = _side(chart, index, flat)
+    status = chart.sides(index, flat)
     surface, inner, outer, first, second = [], [], [], [], []
     start = crossings = 0
     for s, place in enumerate(places):
@@ -267,18 +155,7 @@ def _march(
     return a, b, chords[:, 0], chords[:, 1]
 
 
-def _halve(chart: _Chart, surface: np.ndarray, inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
-    """Return where between two places the face ends, shape (X, 2)."""
-    low, high = inner.copy(), outer.copy()
-    side = _side(chart, surface, low)
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        same = _side(chart, surface, middle) == side
-        low[same], high[~same] = middle[same], middle[~same]
-    return 0.5 * (low + high)
-
-
-def _follow(chart: _Chart, chords: _Chords) -> _Chords:
+def _follow(chart: Chart, chords: _Chords) -> _Chords:
     """Split chords where the edge leaves them, until none is further off than the limit."""
     done: list[_Chords] = []
     for _ in range(_SPLITS):
@@ -287,8 +164,8 @@ def _follow(chart: _Chart, chords: _Chords) -> _Chords:
         aside = np.stack([-run[:, 1], run[:, 0]], axis=1)
         length = np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-30)
         near = aside * (_DEVIATION / length)
-        bent = _side(chart, chords.surface, middle + near) == _side(
-            chart, chords.surface, middle - near
+        bent = chart.sides(chords.surface, middle + near) == chart.sides(
+            chords.surface, middle - near
         )
         moved = np.zeros(len(bent), bool)
         low, high = middle.copy(), middle.copy()
@@ -297,12 +174,12 @@ def _follow(chart: _Chart, chords: _Chords) -> _Chords:
             low[left] = middle[left] + share * aside[left]
             high[left] = middle[left] - share * aside[left]
             on = chords.surface[left]
-            moved[left] = _side(chart, on, low[left]) != _side(chart, on, high[left])
+            moved[left] = chart.sides(on, low[left]) != chart.sides(on, high[left])
         place = middle.copy()
-        place[moved] = _halve(chart, chords.surface[moved], low[moved], high[moved])
+        place[moved] = chart.ends(chords.surface[moved], low[moved], high[moved])
         # Straight in the parameters may still be an arc in space.
-        ends = [_points(chart, chords.surface, end) for end in (chords.first, chords.second)]
-        sag = _points(chart, chords.surface, place) - 0.5 * (ends[0] + ends[1])
+        ends = [chart.points(chords.surface, end) for end in (chords.first, chords.second)]
+        sag = chart.points(chords.surface, place) - 0.5 * (ends[0] + ends[1])
         split = moved | (np.linalg.norm(sag, axis=1) > _DEVIATION)
         done.append(_Chords(*(values[~split] for values in chords)))
         if not split.any():
@@ -327,9 +204,9 @@ def _kinds(part: FlatPart, surface: np.ndarray, start: np.ndarray, end: np.ndarr
     run /= np.maximum(np.linalg.norm(run, axis=1, keepdims=True), 1e-30)
     middle = 0.5 * (start + end)
     normal = gradient(surfaces, surface, middle)
-    normal *= _side_near(part, surface, middle, run)[:, None]
-    near, other = _passing(part, surface, start, middle, end)
-    side = _side_near(part, other, middle[near], run[near])
+    normal *= side_near(part, surface, middle, run, _PROBE)[:, None]
+    near, other = passing(part, surface, (start, end), _TOUCH, 2.0 * _DEVIATION)
+    side = side_near(part, other, middle[near], run[near], _PROBE)
     near, other, side = near[side != 0], other[side != 0], side[side != 0]
     neighbour = gradient(surfaces, other, middle[near]) * side[:, None]
     cosine = np.einsum("ij,ij->i", normal[near], neighbour)
@@ -344,42 +221,3 @@ def _kinds(part: FlatPart, surface: np.ndarray, start: np.ndarray, end: np.ndarr
     kind = np.full(len(start), EdgeClass.NONE, np.uint8)
     kind[near[order]] = found[order]
     return kind
-
-
-def _passing(
-    part: FlatPart, surface: np.ndarray, start: np.ndarray, middle: np.ndarray, end: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return chords, and for each the other surfaces that pass through an end and the middle."""
-    near, other = [], []
-    for s, limits in enumerate(part.surface_boxes):
-        close = ((middle >= limits[0] - _PROBE) & (middle <= limits[1] + _PROBE)).all(axis=1)
-        chosen = np.flatnonzero(close & (surface != s))
-        index = np.full(len(chosen), s, np.int32)
-        gaps = [np.abs(distance(part.surfaces, index, p[chosen])) for p in (start, middle, end)]
-        chosen = chosen[(np.minimum(gaps[0], gaps[2]) < _TOUCH) & (gaps[1] < 2.0 * _DEVIATION)]
-        near.append(chosen)
-        other.append(np.full(len(chosen), s, np.int32))
-    return np.concatenate(near), np.concatenate(other)
-
-
-def _side_near(
-    part: FlatPart, surface: np.ndarray, point: np.ndarray, run: np.ndarray
-) -> np.ndarray:
-    """Return on which side of its surface the part lies, close to a point of an edge; 0 = none.
-
-    Args:
-        part: The solid.
-        surface: Surface of every point, shape (N,).
-        point: Points on it [mm], shape (N, 3).
-        run: Direction of the edge, shape (N, 3).
-    """
-    across = np.cross(run, gradient(part.surfaces, surface, point))
-    side = np.zeros(len(point), np.int32)
-    for sign in (-_PROBE, _PROBE):
-        probe = point + sign * across
-        for _ in range(2):
-            step = distance(part.surfaces, surface, probe)
-            probe -= step[:, None] * gradient(part.surfaces, surface, probe)
-        there = classify(part, probe, surface)
-        side = np.where(side == 0, there, side)
-    return side

@@ -23,6 +23,7 @@ _SKIP_FALSE, _SKIP_TRUE = int(Op.SKIP_FALSE), int(Op.SKIP_TRUE)
 _FAR = 1e30
 _NEAR = 1e-9  # a hit closer to the origin of its ray than this is the origin itself [mm]
 _HALVINGS = 48
+_SLACK = 1e-5  # a hit may be this far outside of the box around the faces of its surface [mm]
 
 
 class Hits(NamedTuple):
@@ -67,8 +68,9 @@ def cast(
     sides = runtime.empty(count, np.int32)
     _cast_rays(
         runtime.upload(part.code), _boxes(part), runtime.upload(part.surfaces.kind),
-        runtime.upload(part.surfaces.data), _rows(origins), _rows(directions),
-        runtime.upload(limits), int(any_hit), distances, surfaces, sides,
+        runtime.upload(part.surfaces.data), _rows(part.surface_boxes.reshape(-1, 6)),
+        _rows(origins), _rows(directions), runtime.upload(limits), int(any_hit),
+        distances, surfaces, sides,
     )  # fmt: skip
     runtime.sync()
     found = runtime.download(surfaces)[:count]
@@ -323,6 +325,16 @@ def _meets_box(boxes: ti.template(), b, origin, direction, reach):
     return enter <= leave
 
 
+@ti.func
+def _in_box(boxes: ti.template(), b, p):
+    """Say whether a place is in box b, or as good as in it."""
+    inside = True
+    for k in ti.static(range(3)):
+        if p[k] < boxes[b, k] - _SLACK or p[k] > boxes[b, k + 3] + _SLACK:
+            inside = False
+    return inside
+
+
 @ti.kernel
 def _cast_rays(
     # In:
@@ -330,6 +342,7 @@ def _cast_rays(
     boxes_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
+    faces_in: F64Rows,
     origins_in: F64Rows,
     directions_in: F64Rows,
     reach_in: F64Array,
@@ -359,10 +372,10 @@ def _cast_rays(
                 crossings = _crossings(kinds_in[arg], data_in, arg, origin, direction)
                 for k in range(4):
                     t = crossings[k]
-                    if _NEAR < t < best:
-                        bits = _solid_if(
-                            code_in, boxes_in, kinds_in, data_in, origin + t * direction, arg
-                        )
+                    p = origin + t * direction
+                    # Whoever is outside of this box need not be asked about the whole part.
+                    if _NEAR < t < best and _in_box(faces_in, arg, p):
+                        bits = _solid_if(code_in, boxes_in, kinds_in, data_in, p, arg)
                         if bits == 1 or bits == 2:
                             best = t
                             surface = arg

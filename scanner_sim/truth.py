@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from octoseg_ti.types import NONE, EdgeClass, Truth
-from scanner_sim.edges import nearest_edge, trace_edges
-from scanner_sim.quadric import distance, gradient
-from scanner_sim.raycast import classify
+from scanner_sim.edges import trace_edges
+from scanner_sim.faces import goes_on
+from scanner_sim.nearest import nearest_edge
 
 if TYPE_CHECKING:
     from scanner_sim.part import FlatPart
 
 _SLIVER = 30  # a smaller piece is no patch: too few points to fit a surface to
 _LINKS = 16
-_BETWEEN = np.array([0.2, 0.4, 0.6, 0.8])
 
 
 def build_truth(
@@ -93,6 +92,8 @@ def find_patches(
     pairs = pairs[(faces.length(pairs) <= reach)]
     pairs = pairs[faces.connect(pairs)]
     piece = _components(pairs, len(position))
+    # Most pieces overlap far from any edge; what is left to bridge are few points near edges.
+    piece = _components(_overlaps(faces, piece, reach), piece.max() + 1)[piece]
     piece = _components(_bridges(faces, piece, reach), piece.max() + 1)[piece]
     size = np.bincount(piece)
     size[piece[part.surfaces.fillet[surface]]] = 0
@@ -146,13 +147,21 @@ class _Faces(NamedTuple):
         doubtful = np.flatnonzero(room <= 1.1 * self.length(pairs) + 0.02)
         first, second = self.position[pairs[doubtful]].transpose(1, 0, 2)
         surface = self.surface[pairs[doubtful, 0]]
-        for share in _BETWEEN:
-            middle = (1.0 - share) * first + share * second
-            for _ in range(2):
-                step = distance(self.part.surfaces, surface, middle)
-                middle -= step[:, None] * gradient(self.part.surfaces, surface, middle)
-            whole[doubtful] &= classify(self.part, middle, surface) != 0
+        whole[doubtful] = goes_on(self.part, surface, first, second)
         return whole
+
+
+def _overlaps(faces: _Faces, piece: np.ndarray, reach: float) -> np.ndarray:
+    """Return pairs of pieces of one face that share a small cell with no edge near it."""
+    size = reach / 3.0
+    inner = np.flatnonzero(faces.edge_distance > 2.0 * size)
+    cell = np.floor((faces.position[inner] - faces.position.min(axis=0)) / size).astype(np.int64)
+    shape = (*(cell.max(axis=0, initial=0) + 1), len(faces.part.surfaces.kind))
+    key = np.ravel_multi_index((*cell.T, faces.surface[inner]), shape)
+    order = np.argsort(key, kind="stable")
+    key, own = key[order], piece[inner[order]]
+    same = np.flatnonzero((key[1:] == key[:-1]) & (own[1:] != own[:-1]))
+    return np.column_stack([own[same], own[same + 1]])
 
 
 def _bridges(faces: _Faces, piece: np.ndarray, reach: float) -> np.ndarray:

@@ -30,7 +30,7 @@ class DemoOptions:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")] = Path("octoseg_demo")
     """Folder to write."""
     part: str = "test-block"
-    """Part on the table: two-planes, test-block or phone."""
+    """Part on the table: two-planes, test-block, phone, random:SEED or random:SEED:FAMILY."""
     seed: int = 7
     """Seed of noise and dropouts."""
     range_noise: float = 0.01

@@ -30,7 +30,8 @@ class SimulateOptions:
     """
 
     part: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PART")]
-    """Part on the table: two-planes, test-block or phone."""
+    """Part on the table: two-planes, test-block, phone, or a random block: random:SEED or
+    random:SEED:FAMILY with the families sharp, filleted, smooth and mixed (default)."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """File to write, by suffix: .mcap .npz .ply .rrd"""
     seed: int = 7
@@ -74,10 +75,16 @@ def find_part(name: str) -> Any:
     Raises:
         UsageError: There is none of this name.
     """
+    from octoseg_ti.errors import DataError
     from scanner_sim import blocks
 
+    if name.partition(":")[0] == "random":
+        try:
+            return blocks.by_name(name)
+        except DataError as error:
+            raise UsageError(f"{error}") from error
     if name not in blocks.PARTS:
-        known = ", ".join(blocks.PARTS)
+        known = ", ".join([*blocks.PARTS, "random:SEED[:FAMILY]"])
         raise UsageError(f"no part {name!r}{suggest(name, list(blocks.PARTS))}; parts: {known}")
     return blocks.by_name(name)
 

@@ -87,6 +87,8 @@ def test_every_option_has_a_help_text(verb: str) -> None:
         (["play", __file__, "--headless", "--spawn"], ["--headless", "--spawn"]),
         (["play", __file__, "--headless", "--loop", "2"], ["--loop"]),
         (["demo", "--part", "blok"], ["no part 'blok'", "test-block"]),
+        (["simulate", "random:x", "-o", "a.npz"], ["seed", "'x'", "random:17"]),
+        (["simulate", "random:1:round", "-o", "a.npz"], ["'round'", "sharp, filleted, smooth"]),
     ],
 )
 def test_wrong_usage_is_one_line(octoseg, arguments: list[str], wanted: list[str]) -> None:

@@ -8,7 +8,8 @@ from itertools import product
 import numpy as np
 
 from octoseg_ti.types import EdgeClass
-from scanner_sim.edges import Edges, nearest_edge, trace_edges
+from scanner_sim.edges import trace_edges
+from scanner_sim.nearest import Edges, nearest_edge
 from scanner_sim.part import (
     Part,
     box,
@@ -157,4 +158,4 @@ def test_nearest_edge_equals_brute_force() -> None:
     offset = points[:, None] - edges.start
     share = np.clip(np.sum(offset * span, axis=2) / np.sum(span * span, axis=1), 0, 1)
     brute = np.linalg.norm(offset - share[..., None] * span, axis=2).min(axis=1)
-    np.testing.assert_allclose(nearest_edge(edges, points)[0], brute, atol=2e-3)
+    np.testing.assert_allclose(nearest_edge(edges, points)[0], brute, atol=1e-12)
