@@ -134,9 +134,7 @@ def _opened(kind: np.ndarray, data: np.ndarray, mesh: Mesh, face: np.ndarray) ->
     return data
 
 
-def _same_forms(
-    kind: np.ndarray, data: np.ndarray, middle: np.ndarray, size: float
-) -> np.ndarray:
+def _same_forms(kind: np.ndarray, data: np.ndarray, middle: np.ndarray, size: float) -> np.ndarray:
     """Return the number of the surface of every face, shape (F,): equal for equal surfaces."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components

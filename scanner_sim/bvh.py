@@ -219,7 +219,9 @@ def _cast_rays(
     for i in range(origins_in.shape[0]):
         origin = _vector(origins_in, i, 0)
         direction = _vector(directions_in, i, 0)
-        inverse = ti.Vector([_inverse(direction[0]), _inverse(direction[1]), _inverse(direction[2])])
+        inverse = ti.Vector(
+            [_inverse(direction[0]), _inverse(direction[1]), _inverse(direction[2])]
+        )
         along = _main_axis(direction)
         ray = _turned(direction, along)
         best = reach_in[i]

@@ -85,13 +85,15 @@ class MeshPart:
         surface[found] = index
         ahead = directions[found]
         place = origins[found] + far[found, None] * ahead
-        normal[found] = self._interpolated(triangle[found], place)
         exact = np.flatnonzero(np.isfinite(self.surfaces.data[index, 0]))
         moved, fine = self._refined(index[exact], place[exact], ahead[exact])
-        exact = exact[fine]
-        far[found[exact]] += moved[fine]
-        place = place[exact] + moved[fine, None] * ahead[exact]
-        normal[found[exact]] = gradient(self.surfaces, index[exact], place)
+        exact, moved = exact[fine], moved[fine]
+        far[found[exact]] += moved
+        on = place[exact] + moved[:, None] * ahead[exact]
+        normal[found[exact]] = gradient(self.surfaces, index[exact], on)
+        rest = np.ones(len(found), bool)
+        rest[exact] = False
+        normal[found[rest]] = self._interpolated(triangle[found[rest]], place[rest])
         away = np.einsum("ij,ij->i", normal, directions) > 0.0
         normal[away] *= -1.0
         return TargetHits(far, surface, normal)
@@ -106,7 +108,9 @@ class MeshPart:
         share = np.clip(np.stack([first, second, 1.0 - first - second], axis=1), 0.0, 1.0)
         normal = np.einsum("ij,ijk->ik", share, self.normals[triangle])
         length: np.ndarray = np.linalg.norm(normal, axis=1, keepdims=True)
-        return np.where(length > 1e-12, normal / np.maximum(length, 1e-300), self.normals[triangle, 0])
+        return np.where(
+            length > 1e-12, normal / np.maximum(length, 1e-300), self.normals[triangle, 0]
+        )
 
     def _refined(
         self, index: np.ndarray, place: np.ndarray, ahead: np.ndarray
@@ -135,9 +139,9 @@ class MeshPart:
         if len(left):
             point = place[left] + moved[left, None] * ahead[left]
             fine[left] = np.abs(distance(self.surfaces, index[left], point)) <= 100.0 * tiny
-        slope = np.abs(
-            np.einsum("ij,ij->i", gradient(self.surfaces, index, place), ahead)
-        ).clip(_GRAZING)
+        slope = np.abs(np.einsum("ij,ij->i", gradient(self.surfaces, index, place), ahead)).clip(
+            _GRAZING
+        )
         return moved, fine & (np.abs(moved) <= 10.0 * self.deflection / slope + 100.0 * tiny)
 
     def hidden(

@@ -7,6 +7,7 @@ the groups of an OBJ file. PLY is read by plyfile.
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -85,7 +86,7 @@ def read_obj(path: Path) -> Soup:
                 ring = [_place(w, len(vertices)) for w in words[1:]]
                 if len(ring) < 3:
                     raise ValueError("a face has three vertices or more")
-                triangles += [(ring[0], b, c) for b, c in zip(ring[1:], ring[2:], strict=False)]
+                triangles += [(ring[0], b, c) for b, c in pairwise(ring[1:])]
                 label += [current] * (len(ring) - 2)
         except ValueError as error:
             raise DataError(f"not an OBJ file (line {number}: {error})", path=path) from error

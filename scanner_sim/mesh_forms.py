@@ -1,4 +1,4 @@
-"""The kind of a smooth group of triangles: plane, cylinder, cone or sphere, where it is beyond doubt.
+"""The kind of a smooth group of triangles: plane, cylinder, cone or sphere where it is certain.
 
 A form counts only when all vertices lie on it within the tolerance, and when there are more of them
 than any such form would pass through by chance. All else is free-form.
@@ -11,8 +11,11 @@ import numpy as np
 from octoseg_ti.types import SurfaceKind
 from scanner_sim.topology import Mesh
 
-_RULINGS = 6  # a circle goes through any 3 points; so many different ones make it a cylinder or cone
+_RULINGS = (
+    6  # a circle goes through any 3 points; so many different ones make it a cylinder or cone
+)
 _SPHERE_POINTS = 8  # a sphere goes through any 4
+_TURN = 1e-3  # directions that differ by less are one [rad]
 _STRAIGHT = 1e-2  # normals of a cylinder or cone keep their angle with the axis this well [rad]
 
 
@@ -41,6 +44,8 @@ def _kind(points: np.ndarray, normals: np.ndarray, tolerance: float) -> SurfaceK
     flat = np.linalg.eigh(centred.T @ centred)[1][:, 0]
     if np.abs(centred @ flat).max() <= tolerance:
         return SurfaceKind.PLANE
+    if len(np.unique(np.round(normals / _TURN), axis=0)) < _RULINGS - 1:
+        return SurfaceKind.FREE_FORM
     # The normals of a cylinder or cone keep one angle with the axis: they differ least along it.
     spread = normals - normals.mean(axis=0)
     axis = np.linalg.eigh(spread.T @ spread)[1][:, 0]
@@ -96,8 +101,8 @@ def _is_cone(points: np.ndarray, axis: np.ndarray, tolerance: float) -> bool:
     centre = answer[:2]
     radius = np.linalg.norm(across - centre, axis=1)
     slope, rest = np.polyfit(height, radius, 1)
-    around = np.arctan2(*(across - centre).T)[:, None] * radius.max()
-    enough = _distinct(around, tolerance) >= _RULINGS and abs(slope) > _STRAIGHT
+    around = np.arctan2(*(across - centre).T)[radius > 4.0 * tolerance]
+    enough = len(np.unique(np.round(around / _TURN))) >= _RULINGS and abs(slope) > _STRAIGHT
     gap = np.abs(radius - (slope * height + rest)) / np.hypot(slope, 1.0)
     return bool(enough and gap.max() <= tolerance)
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -16,6 +14,7 @@ from scanner_sim.mesh import MeshPart, no_form
 from scanner_sim.mesh_files import Soup, read_obj, read_ply, read_stl
 from scanner_sim.mesh_forms import kinds_of
 from scanner_sim.quadric import Surfaces
+from scanner_sim.solid_options import MM, SUFFIXES, SolidOptions
 from scanner_sim.topology import (
     angles_between,
     corner_normals,
@@ -29,52 +28,8 @@ from scanner_sim.topology import (
 )
 
 MESHES: dict[str, Callable[[Path], Soup]] = {".stl": read_stl, ".obj": read_obj, ".ply": read_ply}
-SUFFIXES = (".step", ".stp", *MESHES)
-"""The files that `read_part` reads."""
-_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 _WELD = 1e-7  # corners this close are one, relative to the part: single precision
 _FLAT = 5e-6  # vertices of a plane may be this far off, relative to the part
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SolidOptions:
-    """How a STEP file or a triangle mesh becomes a part. None means: chosen for the part."""
-
-    unit: Literal["mm", "cm", "m", "inch"] = "mm"
-    """Unit of a mesh file, which does not say it; a STEP file does."""
-    smooth_angle: float | None = None
-    """Triangles of a mesh that meet at a smaller angle belong to one face [rad]; None = in the
-    middle of the widest range between 10 and 60 degrees in which the mesh has no angle, or 30
-    degrees."""
-    face_labels: bool = True
-    """Take the groups of an OBJ file and the labels of PLY faces as the faces of the mesh."""
-    deflection: float | None = None
-    """Distance of the triangles from the surfaces of a STEP file [mm]; None = 1/50,000 of the
-    diagonal of its box. Planes, cylinders, cones, spheres and tori are hit exactly all the same."""
-    angular_deflection: float = 0.1
-    """Angle between neighbouring triangles on the surfaces of a STEP file [rad]."""
-    fillet_radius: float | None = None
-    """Cylinders, spheres and tori of a STEP file that join two faces or more smoothly, with a
-    radius up to this, are fillets: edges, not patches [mm]; 0 = none, None = 1/40 of the diagonal
-    of the box."""
-
-    def __post_init__(self) -> None:
-        """Check every value.
-
-        Raises:
-            DataError: A value is outside its range; the message names it.
-        """
-        for name, low, high in (("smooth_angle", 0.0, math.pi), ("deflection", 0.0, math.inf),
-                                ("angular_deflection", 0.0, math.pi)):  # fmt: skip
-            value = getattr(self, name)
-            if value is not None and not (low < value < high and math.isfinite(value)):
-                raise DataError(f"SolidOptions: {name} must be above 0, not {value}")
-        radius = self.fillet_radius
-        if radius is not None and not (radius >= 0.0 and math.isfinite(radius)):
-            raise DataError(f"SolidOptions: fillet_radius must be 0 or more, not {radius}")
-        if self.unit not in _MM:
-            known = ", ".join(_MM)
-            raise DataError(f"SolidOptions: unit must be one of {known}, not {self.unit!r}")
 
 
 def read_part(path: str | Path, options: SolidOptions | None = None) -> MeshPart:
@@ -118,7 +73,7 @@ def read_part(path: str | Path, options: SolidOptions | None = None) -> MeshPart
 def _mesh(path: Path, soup: Soup, options: SolidOptions) -> MeshPart:
     """Return the part of a file's triangles."""
     part = mesh_part(
-        soup.corners * _MM[options.unit], label=soup.label if options.face_labels else None,
+        soup.corners * MM[options.unit], label=soup.label if options.face_labels else None,
         smooth_angle=options.smooth_angle, name=path.name, path=path,
     )  # fmt: skip
     info = {"format": path.suffix[1:].lower(), "unit": options.unit, **part.info}
@@ -186,5 +141,6 @@ def mesh_part(
     return MeshPart(
         mesh=mesh, surface=surface, normals=shading, info=info, name=name,
         surfaces=Surfaces(kind=kinds, data=no_form(count), fillet=fillet),
-        edges=edge_curves(mesh, links, surface, shading, fillet),
+        edges=edge_curves(mesh, links, surface, np.repeat(normals[:, None], 3, axis=1), fillet,
+                          smooth=limit),
     )  # fmt: skip

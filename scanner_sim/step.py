@@ -18,7 +18,9 @@ from octoseg_ti.types import SurfaceKind
 from scanner_sim.brep import Faces, brep_part
 from scanner_sim.mesh import MeshPart, no_form
 
-_DEFLECTION = 2e-5  # default, relative to the diagonal of the box
+_DEFLECTION = (5e-5, 2e-5)
+"""Default deflection, relative to the diagonal of the box: where every face has an exact form, and
+where rays end on the triangles of free-form faces."""
 _EXACT = 1e-6  # a free-form surface this close to a quadric is one, relative to the part
 
 
@@ -42,7 +44,7 @@ def read_step(
     Args:
         path: The file.
         deflection: Distance of the triangles from the surfaces [mm]; None = 1/50,000 of the
-            diagonal of the box.
+            diagonal of the box, or 1/20,000 when no face is free-form.
         angular: Angle between neighbouring triangles [rad].
         fillet_radius: See `SolidOptions`.
 
@@ -60,12 +62,13 @@ def read_step(
         hint = "a file with solids or surfaces is wanted"
         raise DataError("the STEP file has no faces", path=path, hint=hint)
     size = _size(shape)
+    looks = [_form(face, _EXACT * size) for face in faces]
     if deflection is None:
-        deflection = _DEFLECTION * size
+        deflection = _DEFLECTION[any(f.kind == SurfaceKind.FREE_FORM for f in looks)] * size
     BRepMesh_IncrementalMesh(shape, deflection, False, angular, True)
-    corners, normals, face, forms, bare = [], [], [], [], 0
-    for each in faces:
-        form = _form(each, _EXACT * size)
+    corners, normals, face, bare = [], [], [], 0
+    forms: list[_Form] = []
+    for each, form in zip(faces, looks, strict=True):
         triangles = _triangles(each, form.kind == SurfaceKind.FREE_FORM)
         bare += triangles is None
         if triangles is not None:
@@ -113,7 +116,8 @@ def _each(shape: Any, what: Any) -> list[Any]:
     """Return the shapes of one type within a shape, each once."""
     from OCP.TopExp import TopExp_Explorer
 
-    explorer, found = TopExp_Explorer(shape, what), {}
+    explorer = TopExp_Explorer(shape, what)
+    found: dict[int, list[Any]] = {}
     while explorer.More():
         current = explorer.Current()
         same = found.setdefault(hash(current), [])

@@ -239,7 +239,12 @@ def corner_normals(mesh: Mesh, normals: np.ndarray, group: np.ndarray) -> np.nda
 
 
 def edge_curves(
-    mesh: Mesh, links: Links, surface: np.ndarray, normals: np.ndarray, fillet: np.ndarray
+    mesh: Mesh,
+    links: Links,
+    surface: np.ndarray,
+    normals: np.ndarray,
+    fillet: np.ndarray,
+    smooth: float = SMOOTH,
 ) -> Edges:
     """Return the pieces at which two surfaces meet, or one ends.
 
@@ -249,6 +254,7 @@ def edge_curves(
         surface: Surface of every triangle, shape (T,).
         normals: Normals of the surfaces at the corners of every triangle, shape (T, 3, 3).
         fillet: True for the surfaces that are fillets, shape (S,).
+        smooth: Surfaces that meet at a smaller angle meet smoothly [rad].
     """
     apart = np.flatnonzero(surface[links.first] != surface[links.second])
     one, two = links.first[apart], links.second[apart]
@@ -260,7 +266,7 @@ def edge_curves(
     angle = np.arctan2(sine, np.einsum("ij,ij->i", here, there))
     fillets = fillet[surface[one]].astype(int) + fillet[surface[two]]
     kind = np.select(
-        [angle > SMOOTH, fillets == 1, fillets == 0],
+        [angle > smooth, fillets == 1, fillets == 0],
         [EdgeClass.SHARP, EdgeClass.FILLET, EdgeClass.SMOOTH], EdgeClass.NONE,
     )  # fmt: skip
     triangle = np.concatenate([one, links.border])
