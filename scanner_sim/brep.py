@@ -102,6 +102,7 @@ def brep_part(
     return MeshPart(
         mesh=mesh, surface=surface, normals=normals, surfaces=surfaces, name=name, info=info,
         edges=edge_curves(mesh, links, surface, normals, surfaces.fillet), deflection=deflection,
+        curved=(faces.kind == SurfaceKind.FREE_FORM)[first],
     )  # fmt: skip
 
 

@@ -1,8 +1,9 @@
 """A solid of triangles: what reads STEP, STL, OBJ and PLY gives, and what `simulate` can scan.
 
 Where a surface has an exact form (the faces of a STEP file that are planes, cylinders, cones,
-spheres and tori) the triangles only find it: the ray is then followed to the form itself. On all
-other surfaces the triangle is the truth.
+spheres and tori) the triangles only find it: the ray is then followed to the form itself. On the
+free-form faces of a STEP file it is followed to curved patches over the triangles, which are
+checked against the face when the file is read. On all other surfaces the triangle is the truth.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 
 from octoseg_ti.types import EdgeClass, SurfaceKind, Truth
 from scanner_sim.bvh import Tree, build_tree, cast_triangles
+from scanner_sim.curved import meet_patches, mixed, shares
 from scanner_sim.edges import Edges, nearest_edge
 from scanner_sim.quadric import Surfaces, distance, gradient
 from scanner_sim.scanner import StripeScanner, View
@@ -48,6 +50,9 @@ class MeshPart:
     and the triangles are the truth."""
     edges: Edges
     """Where surfaces meet or end."""
+    curved: np.ndarray
+    """True where rays go on from the triangles of a surface to the curved patches over them, shape
+    (S,), bool."""
     deflection: float = 0.0
     """Largest distance of a triangle from the exact form of its surface [mm]."""
     name: str = ""
@@ -93,24 +98,18 @@ class MeshPart:
         normal[found[exact]] = gradient(self.surfaces, index[exact], on)
         rest = np.ones(len(found), bool)
         rest[exact] = False
-        normal[found[rest]] = self._interpolated(triangle[found[rest]], place[rest])
+        bent = np.flatnonzero(rest & self.curved[index])
+        plain = np.flatnonzero(rest & ~self.curved[index])
+        corners = self.mesh.vertices[self.mesh.triangles[triangle[found]]]
+        shading = self.normals[triangle[found]]
+        moved, normal[found[bent]] = meet_patches(
+            corners[bent], shading[bent], place[bent], ahead[bent]
+        )
+        far[found[bent]] += moved
+        normal[found[plain]] = mixed(shares(corners[plain], place[plain]), shading[plain])
         away = np.einsum("ij,ij->i", normal, directions) > 0.0
         normal[away] *= -1.0
         return TargetHits(far, surface, normal)
-
-    def _interpolated(self, triangle: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Return the normal at points of triangles, between those at the corners, shape (N, 3)."""
-        a, b, c = self.mesh.vertices[self.mesh.triangles[triangle]].transpose(1, 0, 2)
-        whole = np.cross(b - a, c - a)
-        squared = np.einsum("ij,ij->i", whole, whole)
-        first = np.einsum("ij,ij->i", np.cross(c - b, place - b), whole) / squared
-        second = np.einsum("ij,ij->i", np.cross(a - c, place - c), whole) / squared
-        share = np.clip(np.stack([first, second, 1.0 - first - second], axis=1), 0.0, 1.0)
-        normal = np.einsum("ij,ijk->ik", share, self.normals[triangle])
-        length: np.ndarray = np.linalg.norm(normal, axis=1, keepdims=True)
-        return np.where(
-            length > 1e-12, normal / np.maximum(length, 1e-300), self.normals[triangle, 0]
-        )
 
     def _refined(
         self, index: np.ndarray, place: np.ndarray, ahead: np.ndarray

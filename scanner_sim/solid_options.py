@@ -27,9 +27,9 @@ class SolidOptions:
     face_labels: bool = True
     """Take the groups of an OBJ file and the labels of PLY faces as the faces of the mesh."""
     deflection: float | None = None
-    """Distance of the triangles from the surfaces of a STEP file [mm]; None = 1/50,000 of the
-    diagonal of its box, or 1/20,000 when no face is free-form. Planes, cylinders, cones, spheres
-    and tori are hit exactly all the same."""
+    """Distance of the triangles from the surfaces of a STEP file [mm]; None = 1/20,000 of the
+    diagonal of its box, or less where free-form faces need it. Planes, cylinders, cones, spheres
+    and tori are hit exactly all the same, free-form faces within 1/100,000 of the diagonal."""
     angular_deflection: float = 0.1
     """Angle between neighbouring triangles on the surfaces of a STEP file [rad]."""
     fillet_radius: float | None = None

@@ -140,6 +140,7 @@ def mesh_part(
     }
     return MeshPart(
         mesh=mesh, surface=surface, normals=shading, info=info, name=name,
+        curved=np.zeros(count, bool),
         surfaces=Surfaces(kind=kinds, data=no_form(count), fillet=fillet),
         edges=edge_curves(mesh, links, surface, np.repeat(normals[:, None], 3, axis=1), fillet,
                           smooth=limit),

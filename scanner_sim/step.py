@@ -16,11 +16,13 @@ import numpy as np
 from octoseg_ti.errors import DataError, MissingPackageError
 from octoseg_ti.types import SurfaceKind
 from scanner_sim.brep import Faces, brep_part
+from scanner_sim.curved import mixed, patch_points, shares
 from scanner_sim.mesh import MeshPart, no_form
 
-_DEFLECTION = (5e-5, 2e-5)
-"""Default deflection, relative to the diagonal of the box: where every face has an exact form, and
-where rays end on the triangles of free-form faces."""
+_DEFLECTION = 5e-5  # default, relative to the diagonal of the box
+_ERROR = 1e-5  # free-form faces are laid out finer until the truth is this good, relative as well
+_FINER = 3
+_CHECKED = 3000  # triangles of a face at which the truth is compared with the face
 _EXACT = 1e-6  # a free-form surface this close to a quadric is one, relative to the part
 
 
@@ -43,8 +45,8 @@ def read_step(
 
     Args:
         path: The file.
-        deflection: Distance of the triangles from the surfaces [mm]; None = 1/50,000 of the
-            diagonal of the box, or 1/20,000 when no face is free-form.
+        deflection: Distance of the triangles from the surfaces [mm]; None = 1/20,000 of the
+            diagonal of the box, or less where free-form faces need it.
         angular: Angle between neighbouring triangles [rad].
         fillet_radius: See `SolidOptions`.
 
@@ -53,7 +55,7 @@ def read_step(
         MissingPackageError: OpenCASCADE is not installed.
     """
     try:
-        from OCP.BRepMesh import BRepMesh_IncrementalMesh
+        import OCP.STEPControl  # noqa: F401
     except ImportError as error:
         raise MissingPackageError("cadquery-ocp-novtk", "cad", "reading STEP") from error
     shape = _shape(path)
@@ -62,51 +64,82 @@ def read_step(
         hint = "a file with solids or surfaces is wanted"
         raise DataError("the STEP file has no faces", path=path, hint=hint)
     size = _size(shape)
-    looks = [_form(face, _EXACT * size) for face in faces]
-    if deflection is None:
-        deflection = _DEFLECTION[any(f.kind == SurfaceKind.FREE_FORM for f in looks)] * size
-    BRepMesh_IncrementalMesh(shape, deflection, False, angular, True)
-    corners, normals, face, bare = [], [], [], 0
-    forms: list[_Form] = []
-    for each, form in zip(faces, looks, strict=True):
-        triangles = _triangles(each, form.kind == SurfaceKind.FREE_FORM)
-        bare += triangles is None
-        if triangles is not None:
-            corners.append(triangles[0])
-            normals.append(triangles[1])
-            face.append(np.full(len(triangles[0]), len(forms)))
-            forms.append(form)
-    if not forms:
+    forms = [_form(face, _EXACT * size) for face in faces]
+    step = _DEFLECTION * size if deflection is None else deflection
+    for _ in range(_FINER):
+        sheets = _lay_out(shape, faces, forms, step, angular)
+        error = max((s.error for s in sheets if s is not None), default=0.0)
+        if deflection is not None or error <= _ERROR * size:
+            break
+        step /= 4.0
+    found = [(form, sheet) for form, sheet in zip(forms, sheets, strict=True) if sheet is not None]
+    if not found:
         raise DataError("none of the faces of the STEP file can be tessellated", path=path)
     part = brep_part(
         Faces(
-            corners=np.concatenate(corners), normals=np.concatenate(normals),
-            face=np.concatenate(face), kind=np.array([f.kind for f in forms], np.int32),
-            data=np.stack([f.row for f in forms]),
+            corners=np.concatenate([sheet.corners for _, sheet in found]),
+            normals=np.concatenate([sheet.normals for _, sheet in found]),
+            face=np.repeat(np.arange(len(found)), [len(sheet.corners) for _, sheet in found]),
+            kind=np.array([form.kind for form, _ in found], np.int32),
+            data=np.stack([form.row for form, _ in found]),
         ),
-        deflection=deflection, fillet_radius=fillet_radius, name=path.name, path=path,
+        deflection=step, fillet_radius=fillet_radius, name=path.name, path=path,
     )  # fmt: skip
-    counts = {"format": "step", "solids": str(_solids(shape)), "faces_without_triangles": str(bare)}
-    part.info.update(counts)
+    part.info.update(
+        format="step", solids=str(_solids(shape)), free_form_error_mm=f"{error:.2g}",
+        faces_without_triangles=str(len(faces) - len(found)),
+    )  # fmt: skip
     return part
+
+
+class _Sheet(NamedTuple):
+    """The triangles of one face."""
+
+    corners: np.ndarray
+    """Corners [mm], anticlockwise seen from outside, shape (T, 3, 3)."""
+    normals: np.ndarray
+    """Normals of a free-form surface there, of either sign; else 0, shape (T, 3, 3)."""
+    error: float
+    """Distance of the curved patches from a free-form face, as far as seen [mm]; else 0."""
+
+
+def _lay_out(
+    shape: Any, faces: list[Any], forms: list[_Form], deflection: float, angular: float
+) -> list[_Sheet | None]:
+    """Return the triangles of every face; None where OpenCASCADE fails."""
+    from OCP.BRepMesh import BRepMesh_IncrementalMesh
+    from OCP.BRepTools import BRepTools
+
+    BRepTools.Clean_s(shape)
+    BRepMesh_IncrementalMesh(shape, deflection, False, angular, True)
+    return [
+        _triangles(face, form.kind == SurfaceKind.FREE_FORM)
+        for face, form in zip(faces, forms, strict=True)
+    ]
 
 
 def _shape(path: Path) -> Any:
     """Return everything in the file as one shape."""
     from OCP.IFSelect import IFSelect_RetDone
-    from OCP.Message import Message, Message_Gravity
+    from OCP.Message import Message
     from OCP.STEPControl import STEPControl_Reader
 
     with path.open("rb") as stream:
         if b"ISO-10303-21" not in stream.read(4096):
             raise DataError("not a STEP file", path=path, hint="it begins with ISO-10303-21")
-    for printer in Message.DefaultMessenger_s().Printers():  # its remarks are not our output
-        printer.SetTraceLevel(Message_Gravity.Message_Fail)
-    reader = STEPControl_Reader()
-    if reader.ReadFile(str(path)) != IFSelect_RetDone:
-        raise DataError("not a readable STEP file", path=path, hint="write or fetch it again")
-    reader.TransferRoots()
-    shape = reader.OneShape()
+    messenger = Message.DefaultMessenger_s()
+    printers = list(messenger.Printers())
+    for printer in printers:  # its remarks are not our output
+        messenger.RemovePrinter(printer)
+    try:
+        reader = STEPControl_Reader()
+        if reader.ReadFile(str(path)) != IFSelect_RetDone:
+            raise DataError("not a readable STEP file", path=path, hint="write or fetch it again")
+        reader.TransferRoots()
+        shape = reader.OneShape()
+    finally:
+        for printer in printers:
+            messenger.AddPrinter(printer)
     if shape is None or shape.IsNull():
         raise DataError("the STEP file has no shape", path=path, hint="is it cut off?")
     return shape
@@ -153,11 +186,8 @@ def _size(shape: Any) -> float:
     return float(np.sqrt(box.SquareExtent()))
 
 
-def _triangles(face: Any, free: bool) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return corners [mm] and normals of the triangles of a face, shapes (T, 3, 3); None without.
-
-    The normals are those of the surface itself where it is free-form, else 0.
-    """
+def _triangles(face: Any, free: bool) -> _Sheet | None:
+    """Return the triangles of a face, None without; of a free-form one with normals and error."""
     from OCP.BRep import BRep_Tool
     from OCP.TopAbs import TopAbs_Orientation
     from OCP.TopLoc import TopLoc_Location
@@ -174,26 +204,52 @@ def _triangles(face: Any, free: bool) -> tuple[np.ndarray, np.ndarray] | None:
     triangles = np.array([mesh.Triangle(i).Get() for i in range(1, mesh.NbTriangles() + 1)]) - 1
     if face.Orientation() == TopAbs_Orientation.TopAbs_REVERSED:
         triangles = triangles[:, ::-1]
-    normals = _normals(face, mesh) if free else np.zeros((len(nodes), 3))
-    return nodes[triangles], normals[triangles]
+    corners = nodes[triangles]
+    if not free or not mesh.HasUVNodes():
+        return _Sheet(corners, np.zeros_like(corners), 0.0)
+    places = np.array([mesh.UVNode(i).Coord() for i in range(1, mesh.NbNodes() + 1)])
+    normals = _normals(face, places)[triangles]
+    return _Sheet(corners, normals, _error(face, corners, normals, places[triangles]))
 
 
-def _normals(face: Any, mesh: Any) -> np.ndarray:
-    """Return the normal of the surface at every node; 0 where it has none; either sign."""
+def _normals(face: Any, places: np.ndarray) -> np.ndarray:
+    """Return the normal of the surface at (u, v); 0 where it has none; either sign."""
     from OCP.BRepAdaptor import BRepAdaptor_Surface
     from OCP.gp import gp_Pnt, gp_Vec
 
     surface = BRepAdaptor_Surface(face)
     point, along_u, along_v = gp_Pnt(), gp_Vec(), gp_Vec()
-    rows = np.zeros((mesh.NbNodes(), 2, 3))
-    for i in range(mesh.NbNodes() if mesh.HasUVNodes() else 0):
-        u, v = mesh.UVNode(i + 1).Coord()
+    rows = np.zeros((len(places), 2, 3))
+    for i, (u, v) in enumerate(places.tolist()):
         surface.D1(u, v, point, along_u, along_v)
         rows[i] = along_u.Coord(), along_v.Coord()
     normals = np.cross(rows[:, 0], rows[:, 1])
     length: np.ndarray = np.linalg.norm(normals, axis=1, keepdims=True)
     scale = np.linalg.norm(rows, axis=2).max(initial=0.0) ** 2
     return np.where(length > 1e-9 * scale, normals / np.maximum(length, 1e-300), 0.0)
+
+
+def _error(face: Any, corners: np.ndarray, normals: np.ndarray, places: np.ndarray) -> float:
+    """Return the largest distance of the face from the curved patches over its triangles [mm].
+
+    It is measured above the middle of triangles, evenly chosen where there are many.
+    """
+    from OCP.BRepAdaptor import BRepAdaptor_Surface
+
+    surface = BRepAdaptor_Surface(face)
+    # Where there is no normal, the one of the triangle will do: it cannot be told here.
+    sound = np.flatnonzero((np.abs(normals).sum(axis=2) > 0.0).all(axis=1))
+    sound = sound[:: -(-len(sound) // _CHECKED) or 1]
+    if len(sound) == 0:
+        return 0.0
+    middle = places[sound].mean(axis=1).tolist()
+    points = np.array([surface.Value(u, v).Coord() for u, v in middle])
+    corners, normals = corners[sound], normals[sound]
+    first = normals[:, :1]
+    normals = normals * np.sign(np.einsum("ijk,ijk->ij", normals, first) + 1e-300)[:, :, None]
+    share = shares(corners, points)
+    gap = patch_points(corners, normals, share) - points
+    return float(np.abs(np.einsum("ij,ij->i", gap, mixed(share, normals))).max())
 
 
 def _form(face: Any, tolerance: float) -> _Form:

@@ -69,7 +69,7 @@ def test_no_ray_leaves_a_closed_mesh_between_its_triangles(name: str) -> None:
     share = np.linspace(0.0, 1.0, 7)[:, None, None]
     ends = np.concatenate([corners, np.roll(corners, -1, axis=1)]).reshape(2, -1, 3)
     aims = ((1 - share) * ends[0] + share * ends[1]).reshape(-1, 3)
-    inside = corners.reshape(-1, 3).mean(axis=0) + [0.123, -0.234, 0.345]
+    inside = corners.reshape(-1, 3).mean(axis=0) + np.array([0.123, -0.234, 0.345])
     directions = aims - inside
     length = np.linalg.norm(directions, axis=1)
     directions /= length[:, None]

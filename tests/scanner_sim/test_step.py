@@ -83,11 +83,10 @@ def test_a_bored_block_scans_like_the_same_of_half_spaces(tmp_path: Path) -> Non
     same, true = simulate(csg, scanner)
     assert scans.stripe is not None and same.stripe is not None
     assert scans.column is not None and same.column is not None
-    mine = {(int(s), int(c)): i for i, (s, c) in enumerate(zip(scans.stripe, scans.column))}
-    both = [(mine[key], i) for i, key in enumerate(zip(same.stripe, same.column)) if key in mine]
-    a, b = np.array(both).T
+    keys = [10_000 * s.stripe + s.column for s in (scans, same)]
+    a, b = np.intersect1d(*keys, return_indices=True)[1:]
     # All but points within the deflection of a shadow's border or of an edge.
-    assert len(scans) > 8000 and len(a) > 0.999 * max(len(scans), len(same))
+    assert len(scans) > 6000 and len(a) > 0.999 * max(len(scans), len(same))
     assert truth.position is not None and true.position is not None
     assert truth.normal is not None and true.normal is not None
     off = np.linalg.norm(truth.position[a] - true.position[b], axis=1)
@@ -176,7 +175,7 @@ def test_thin_pins_and_narrow_bores_are_no_fillets(tmp_path: Path) -> None:
     assert not part.surfaces.fillet[kinds == SurfaceKind.CYLINDER].any()
 
 
-def test_free_form_faces_keep_the_triangles_within_the_deflection(tmp_path: Path) -> None:
+def test_free_form_faces_are_met_within_the_error_that_is_stated(tmp_path: Path) -> None:
     from OCP.BRepBuilderAPI import BRepBuilderAPI_GTransform
 
     stretch = gp_GTrsf(gp_Mat(1, 0, 0, 0, 1.5, 0, 0, 0, 0.6), gp_Pnt(0, 0, 0).XYZ())
@@ -190,9 +189,11 @@ def test_free_form_faces_keep_the_triangles_within_the_deflection(tmp_path: Path
     slope = 2.0 * q / [8.0, 12.0, 4.8]
     length = np.linalg.norm(slope, axis=1)
     gap = np.abs((q**2).sum(axis=1) - 1.0) / length
-    assert gap.max() < 1.5 * part.deflection < 0.001
+    # As good as was stated when the file was read, and far better than the triangles.
+    assert gap.max() < 2.0 * float(part.info["free_form_error_mm"]) < 0.0002
+    assert gap.max() < 0.2 * part.deflection
     cosine = (slope / length[:, None] * truth.normal).sum(axis=1)
-    assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.2
+    assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.3
 
 
 def test_planes_written_as_splines_are_planes(tmp_path: Path) -> None:
@@ -207,7 +208,9 @@ def test_several_solids_are_one_part(tmp_path: Path) -> None:
     builder, pair = BRep_Builder(), TopoDS_Compound()
     builder.MakeCompound(pair)
     builder.Add(pair, _block())
-    builder.Add(pair, _block().Moved(__import__("OCP.TopLoc", fromlist=["x"]).TopLoc_Location(shift)))
+    builder.Add(
+        pair, _block().Moved(__import__("OCP.TopLoc", fromlist=["x"]).TopLoc_Location(shift))
+    )
     part = read_part(_write(tmp_path / "pair.step", pair))
     assert part.info["solids"] == "2"
     np.testing.assert_allclose(part.box, [[0, 0, 0], [100, 30, 10]], atol=1e-9)
