@@ -68,8 +68,8 @@ def read_step(
     step = _DEFLECTION * size if deflection is None else deflection
     for _ in range(_FINER):
         sheets = _lay_out(shape, faces, forms, step, angular)
-        error = max((s.error for s in sheets if s is not None), default=0.0)
-        if deflection is not None or error <= _ERROR * size:
+        worst = max((s.error for s in sheets if s is not None), default=0.0)
+        if deflection is not None or worst <= _ERROR * size:
             break
         step /= 4.0
     found = [(form, sheet) for form, sheet in zip(forms, sheets, strict=True) if sheet is not None]
@@ -86,7 +86,7 @@ def read_step(
         deflection=step, fillet_radius=fillet_radius, name=path.name, path=path,
     )  # fmt: skip
     part.info.update(
-        format="step", solids=str(_solids(shape)), free_form_error_mm=f"{error:.2g}",
+        format="step", solids=str(_solids(shape)), free_form_error_mm=f"{worst:.2g}",
         faces_without_triangles=str(len(faces) - len(found)),
     )  # fmt: skip
     return part

@@ -211,7 +211,7 @@ def test_what_is_no_mesh_is_refused(tmp_path: Path) -> None:
         ("far.obj", b"v 0 0 0\nv 1 0 0\nf 1 2 3\n", "line 3"), ("junk.obj", b"v 1 2\n", "line 1"),
         ("points.obj", b"v 0 0 0\n", "no triangles"), ("junk.ply", b"junk", "PLY"),
         ("cut.ply", listing[: len(listing) // 2], "PLY"),
-        ("points.ply", listing[: listing.index(b"element face")] + b"end_header\n" + b"0 0 0\n" * 36,
+        ("points.ply", listing[: listing.index(b"element face")] + b"end_header" + b"\n0 0 0" * 36,
          "no faces"),
         ("line.obj", b"v 0 0 0\nv 1 1 1\nv 2 2 2\nf 1 2 3\n", "none of the 1 triangles"),
         ("part.iges", b"x", "unknown suffix"),
