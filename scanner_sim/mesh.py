@@ -63,20 +63,22 @@ class MeshPart:
     info: dict[str, str] = field(default_factory=dict)
     """How the part came about: format, unit, what was dropped."""
     tree: Tree = field(init=False, repr=False)
+    box: np.ndarray = field(init=False)
+    """Axis-aligned box around the solid [mm], shape (2, 3)."""
+    size: float = field(init=False)
+    """Length of the diagonal of the box [mm]."""
 
     def __post_init__(self) -> None:
         """Build the tree of boxes."""
+        low, high = self.mesh.vertices.min(axis=0), self.mesh.vertices.max(axis=0)
+        object.__setattr__(self, "box", np.stack([low, high]))
+        object.__setattr__(self, "size", float(np.linalg.norm(high - low)))
         object.__setattr__(self, "tree", build_tree(self.mesh.corners(), self.surface))
-
-    @property
-    def box(self) -> np.ndarray:
-        """Axis-aligned box around the solid [mm], shape (2, 3)."""
-        return np.stack([self.mesh.vertices.min(axis=0), self.mesh.vertices.max(axis=0)])
 
     @property
     def stand_off(self) -> float | None:
         """Distance from which a part that is too large for the scanner's default is seen [mm]."""
-        far = 1.5 * self.mesh.size()
+        far = 1.5 * self.size
         return far if far > StripeScanner().stand_off else None
 
     def trace(self, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> TargetHits:
@@ -123,7 +125,7 @@ class MeshPart:
         moved = np.zeros(len(place))
         left = np.arange(len(place))
         fine = np.zeros(len(place), bool)
-        tiny = 1e-14 * (float(np.abs(self.box).max()) + self.mesh.size())
+        tiny = 1e-14 * (float(np.abs(self.box).max()) + self.size)
         for _ in range(_STEPS):
             point = place[left] + moved[left, None] * ahead[left]
             gap = distance(self.surfaces, index[left], point)
@@ -151,7 +153,7 @@ class MeshPart:
         The triangles of a hollow form lie above it, by the deflection at most. So the way begins a
         little more than that above the surface.
         """
-        lift = 2.0 * self.deflection + _LIFT * self.mesh.size()
+        lift = 2.0 * self.deflection + _LIFT * self.size
         found = cast_triangles(
             self.tree, positions + lift * normals, directions, reach, any_hit=True
         )[1]
@@ -163,7 +165,7 @@ class MeshPart:
         stripe: np.ndarray, column: np.ndarray, reach: float, info: dict[str, str],
     ) -> Truth:  # fmt: skip
         """Return the truth about points that `trace` has found; see `build_truth`."""
-        scale = _COMMON / self.mesh.size()
+        scale = _COMMON / self.size
         edges = Edges(self.edges.start * scale, self.edges.end * scale, self.edges.kind)
         edge_distance, edge_class = nearest_edge(edges, position * scale)
         edge_distance /= scale
@@ -196,7 +198,7 @@ class MeshPart:
         length = np.linalg.norm(mean, axis=1, keepdims=True)
         mean = np.where(length > 1e-9, mean / np.maximum(length, 1e-300), normal[first])
         way = np.linalg.norm(position[second] - position[first], axis=1)
-        half = _SIDE * way + 2.0 * self.deflection + _LIFT * self.mesh.size()
+        half = _SIDE * way + 2.0 * self.deflection + _LIFT * self.size
         for share in _BETWEEN:
             left = np.flatnonzero(whole)
             middle = (1.0 - share) * position[first[left]] + share * position[second[left]]
