@@ -25,12 +25,13 @@ class SolidOptions:
     middle of the widest range between 10 and 60 degrees in which the mesh has no angle, or 30
     degrees."""
     face_labels: bool = True
-    """Take the groups of an OBJ file and the labels of PLY faces as the faces of the mesh."""
+    """The groups of an OBJ file and the labels of PLY faces are the faces of the mesh, where there
+    are any; off, smooth groups are."""
     deflection: float | None = None
     """Distance of the triangles from the surfaces of a STEP file [mm]; None = 1/20,000 of the
     diagonal of its box, or less where free-form faces need it. Planes, cylinders, cones, spheres
     and tori are hit exactly all the same, free-form faces within 1/100,000 of the diagonal."""
-    angular_deflection: float = 0.1
+    angular_deflection: float = math.radians(6.0)
     """Angle between neighbouring triangles on the surfaces of a STEP file [rad]."""
     fillet_radius: float | None = None
     """Cylinders, spheres and tori of a STEP file that join two faces or more smoothly, with a

@@ -120,7 +120,9 @@ def mesh_part(
     if label is not None:
         label = np.unique(label[kept], return_inverse=True)[1]
     surface = (group if label is None else label).astype(np.int32)
-    tolerance = _FLAT * mesh.size()
+    # Files hold single precision: far from the origin its rounding is what counts.
+    rounding = float(np.finfo(np.float32).eps * np.abs(mesh.vertices).max())
+    tolerance = max(_FLAT * mesh.size(), 2.0 * rounding)
     kinds = kinds_of(mesh, normals, surface, tolerance)
     count = len(kinds)
     fillet = np.zeros(count, bool)
