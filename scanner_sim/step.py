@@ -66,10 +66,10 @@ def read_step(
     size = _size(shape)
     forms = [_form(face, _EXACT * size) for face in faces]
     step = _DEFLECTION * size if deflection is None else deflection
-    for _ in range(_FINER):
+    for left in reversed(range(_FINER)):
         sheets = _lay_out(shape, faces, forms, step, angular)
         worst = max((s.error for s in sheets if s is not None), default=0.0)
-        if deflection is not None or worst <= _ERROR * size:
+        if deflection is not None or worst <= _ERROR * size or left == 0:
             break
         step /= 4.0
     found = [(form, sheet) for form, sheet in zip(forms, sheets, strict=True) if sheet is not None]
