@@ -11,15 +11,19 @@ if TYPE_CHECKING:
     from scanner_sim.part import Part, box, cone, cylinder, half_space, rod, sphere, torus
     from scanner_sim.scanner import StripeScanner, View
     from scanner_sim.simulate import simulate
+    from scanner_sim.solid_options import SolidOptions
+    from scanner_sim.solids import read_part
 
 _HOME = {
     "Part": "part",
+    "SolidOptions": "solid_options",
     "StripeScanner": "scanner",
     "View": "scanner",
     "box": "part",
     "cone": "part",
     "cylinder": "part",
     "half_space": "part",
+    "read_part": "solids",
     "rod": "part",
     "simulate": "simulate",
     "sphere": "part",
@@ -28,6 +32,7 @@ _HOME = {
 
 __all__ = [
     "Part",
+    "SolidOptions",
     "StripeScanner",
     "View",
     "blocks",
@@ -35,6 +40,7 @@ __all__ = [
     "cone",
     "cylinder",
     "half_space",
+    "read_part",
     "rod",
     "simulate",
     "sphere",

@@ -54,7 +54,8 @@ class StripeScanner:
     """A laser stripe probe on a stage. A value of None means: chosen for the part."""
 
     stand_off: float = 300.0
-    """Distance from the laser to the middle of the part [mm]."""
+    """Distance from the laser to the middle of the part [mm]. Left at its default, a part from a
+    file that is too large for it is seen from 1.5 times the diagonal of its box."""
     triangulation_angle: float = math.radians(30.0)
     """Angle between laser plane and camera, seen from the middle of the part [rad]."""
     stripe_pitch: float | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -9,19 +10,17 @@ import numpy as np
 
 from octoseg_ti.errors import DataError
 from octoseg_ti.types import Scans, Truth
-from scanner_sim.quadric import gradient
-from scanner_sim.raycast import cast
 from scanner_sim.scanner import DEFAULT_VIEWS, StripeScanner, View
-from scanner_sim.truth import build_truth
+from scanner_sim.target import as_target, far_enough
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from scanner_sim.part import FlatPart, Part
+    from scanner_sim.part import Part
+    from scanner_sim.target import Target
 
 _TRIAL_RAYS = 40_000
 _SURPLUS = 1.01  # aim this far above the wanted number; what is too much is thinned out
-_LIFT = 1e-6  # shadow rays start this far above the surface [mm]
 _ATTEMPTS = 6
 
 
@@ -42,7 +41,7 @@ class _Pass(NamedTuple):
 
 
 def simulate(
-    part: Part,
+    part: Part | Target,
     scanner: StripeScanner | None = None,
     *,
     seed: int = 0,
@@ -55,7 +54,7 @@ def simulate(
     number of threads.
 
     Args:
-        part: The solid, in mm.
+        part: The solid, in mm: CSG, or read from a file by `read_part`.
         scanner: The scanner; None takes `StripeScanner` with its defaults.
         seed: Seed of noise and losses; every view draws from its own child of it.
         progress: Called with the name of the work and the share that is done, 0..1.
@@ -69,16 +68,18 @@ def simulate(
     """
     scanner = scanner or StripeScanner()
     report = progress or (lambda name, done: None)
-    flat = part.flat()
+    target = as_target(part)
+    far = far_enough(target, scanner.stand_off, StripeScanner().stand_off)
+    scanner = dataclasses.replace(scanner, stand_off=far)
     views = scanner.views or part.views or DEFAULT_VIEWS
     wanted = scanner.points or part.nominal_points
     free = scanner.stripe_pitch is None and scanner.point_pitch is None
     report("scan", 0.0)
-    across, along = _pitches(flat, part.box, scanner, views, wanted if free else scanner.points)
+    across, along = _pitches(target, scanner, views, wanted if free else scanner.points)
     for _ in range(_ATTEMPTS):
         passes = []
         for v, view in enumerate(views):
-            passes.append(_scan(flat, part.box, scanner, view, across, along))
+            passes.append(_scan(target, scanner, view, across, along))
             report("scan", (v + 1) / len(views))
         root = np.random.SeedSequence(seed)
         generators = [np.random.default_rng(s) for s in root.spawn(len(views) + 1)]
@@ -96,11 +97,10 @@ def simulate(
     exact = wanted if free else scanner.points
     if exact is not None:
         _thin(keep, exact, generators[-1])
-    scans = _assemble(passes, keep, scanner, views, part, generators)
+    scans = _assemble(passes, keep, scanner, views, target, generators)
     report("truth", 0.0)
     assert scans.stripe is not None and scans.column is not None
-    truth = build_truth(
-        flat,
+    truth = target.truth(
         position=np.concatenate([p.position[k] for p, k in zip(passes, keep, strict=True)]),
         normal=np.concatenate([p.normal[k] for p, k in zip(passes, keep, strict=True)]),
         surface=np.concatenate([p.surface[k] for p, k in zip(passes, keep, strict=True)]),
@@ -120,7 +120,7 @@ def simulate(
 
 
 def _pitches(
-    flat: FlatPart, limits: np.ndarray, scanner: StripeScanner, views: tuple[View, ...],
+    target: Target, scanner: StripeScanner, views: tuple[View, ...],
     wanted: int | None,
 ) -> tuple[float, float]:  # fmt: skip
     """Return stripe and point pitch [mm]; what is open follows from the number of points wanted."""
@@ -133,12 +133,12 @@ def _pitches(
         return across, along
     area = 0.0
     for view in views:
-        low, high = _extent(limits, scanner, view)
+        low, high = _extent(target.box, scanner, view)
         area += float(np.prod((high - low)[:2]))
     across = math.sqrt(area / _TRIAL_RAYS * scanner.aspect)
     if wanted is None:
         return across, across / scanner.aspect
-    trial = [_scan(flat, limits, scanner, view, across, across / scanner.aspect) for view in views]
+    trial = [_scan(target, scanner, view, across, across / scanner.aspect) for view in views]
     # Points go with the square of the fineness, ends of stripes (lost ones) only linearly.
     points = float(sum(len(scan.stripe) for scan in trial))
     points *= (1.0 - scanner.dropout) * (1.0 - scanner.lost_stripes)
@@ -174,8 +174,7 @@ def _extent(
 
 
 def _scan(
-    flat: FlatPart,
-    limits: np.ndarray,
+    target: Target,
     scanner: StripeScanner,
     view: View,
     across: float,
@@ -183,8 +182,8 @@ def _scan(
 ) -> _Pass:
     """Return all points that laser and camera both see, in scan order, without noise and losses."""
     rotation = view.rotation()
-    middle = limits.mean(axis=0)
-    low, high = _extent(limits, scanner, view)
+    middle = target.box.mean(axis=0)
+    low, high = _extent(target.box, scanner, view)
     x = _spread(low[0], high[0], across)
     y = _spread(low[1], high[1], along)
     stripes, columns = len(x), len(y)
@@ -195,12 +194,12 @@ def _scan(
     ray_world = ray @ rotation.T
     origins = np.repeat(source_world, columns, axis=0)
     directions = np.tile(ray_world, (stripes, 1))
-    hits = cast(flat, origins, directions, np.full(len(origins), math.inf))
+    hits = target.trace(origins, directions, np.full(len(origins), math.inf))
     found = np.flatnonzero(hits.surface >= 0)
     surface = hits.surface[found]
     sight = directions[found]
     position = origins[found] + hits.distance[found, None] * sight
-    normal = gradient(flat.surfaces, surface, position) * hits.side[found, None]
+    normal = hits.normal[found]
     stripe, column = found // columns, found % columns
     camera = (source[stripe] + scanner.camera) @ rotation.T + middle
     to_camera = camera - position
@@ -212,10 +211,8 @@ def _scan(
         height = (position - middle) @ rotation[:, 2]
         seen &= np.abs(height) <= scanner.depth_of_field / 2
     open_ = np.flatnonzero(seen)
-    shadow = cast(
-        flat, position[open_] + _LIFT * normal[open_], to_camera[open_], far[open_], any_hit=True
-    )
-    chosen = open_[shadow.surface < 0]
+    shadow = target.hidden(position[open_], normal[open_], to_camera[open_], far[open_])
+    chosen = open_[~shadow]
     return _Pass(
         stripe=stripe[chosen].astype(np.int32), column=column[chosen].astype(np.int32),
         source=source_world, position=position[chosen], normal=normal[chosen],
@@ -262,10 +259,10 @@ def _thin(keep: list[np.ndarray], wanted: int, generator: np.random.Generator) -
 
 def _assemble(
     passes: list[_Pass], keep: list[np.ndarray], scanner: StripeScanner, views: tuple[View, ...],
-    part: Part, generators: list[np.random.Generator],
+    target: Target, generators: list[np.random.Generator],
 ) -> Scans:  # fmt: skip
     """Return the scans: noise along the line of sight, points in the frames of their views."""
-    middle = part.box.mean(axis=0)
+    middle = target.box.mean(axis=0)
     poses = np.tile(np.eye(4), (len(views), 1, 1))
     points, stripe, times = [], [], []
     first = 0
@@ -292,5 +289,5 @@ def _assemble(
         origin=np.stack([p.source.mean(axis=0) for p in passes]),
         stripe_origin=np.concatenate([p.source for p in passes]),
         frame="view",
-        name=part.name,
+        name=target.name,
     )

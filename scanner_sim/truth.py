@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from scanner_sim.faces import goes_on
 from scanner_sim.nearest import nearest_edge
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from scanner_sim.mesh import MeshPart
     from scanner_sim.part import FlatPart
 
 _SLIVER = 30  # a smaller piece is no patch: too few points to fit a surface to
@@ -60,13 +63,14 @@ def build_truth(
 
 
 def find_patches(
-    part: FlatPart,
+    part: FlatPart | MeshPart,
     position: np.ndarray,
     surface: np.ndarray,
     stripe: np.ndarray,
     column: np.ndarray,
     edge_distance: np.ndarray,
     reach: float,
+    goes_on: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> np.ndarray:
     """Return the patch of every point: connected visible pieces of faces, by size; -1 on fillets.
 
@@ -82,11 +86,13 @@ def find_patches(
         column: Number of the laser's ray of every point, shape (N,), i32.
         edge_distance: Distance of every point to the nearest edge [mm], shape (N,).
         reach: Distance that connects pieces [mm].
+        goes_on: Says for pairs of points of one face, shape (P, 2), whether the face goes on
+            between them; None asks the CSG part.
 
     Returns:
         Patch of every point, 0..K-1, shape (N,), i32; -1 = none.
     """
-    faces = _Faces(part, position, surface, edge_distance)
+    faces = _Faces(part, position, surface, edge_distance, goes_on)
     pairs = _mesh_pairs(stripe, column)
     pairs = pairs[surface[pairs[:, 0]] == surface[pairs[:, 1]]]
     pairs = pairs[(faces.length(pairs) <= reach)]
@@ -129,10 +135,11 @@ def _components(pairs: np.ndarray, count: int) -> np.ndarray:
 class _Faces(NamedTuple):
     """Points on the faces of a part, and what is known about them."""
 
-    part: FlatPart
+    part: FlatPart | MeshPart
     position: np.ndarray
     surface: np.ndarray
     edge_distance: np.ndarray
+    goes_on: Callable[[np.ndarray], np.ndarray] | None
 
     def length(self, pairs: np.ndarray) -> np.ndarray:
         """Return the distance between the points of every pair [mm], shape (P,)."""
@@ -145,9 +152,12 @@ class _Faces(NamedTuple):
         room = self.edge_distance[pairs].sum(axis=1)
         # Where the edges are too far to come between the points, there is nothing to test.
         doubtful = np.flatnonzero(room <= 1.1 * self.length(pairs) + 0.02)
+        if self.goes_on is not None:
+            whole[doubtful] = self.goes_on(pairs[doubtful])
+            return whole
         first, second = self.position[pairs[doubtful]].transpose(1, 0, 2)
         surface = self.surface[pairs[doubtful, 0]]
-        whole[doubtful] = goes_on(self.part, surface, first, second)
+        whole[doubtful] = goes_on(cast("FlatPart", self.part), surface, first, second)
         return whole
 
 

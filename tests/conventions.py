@@ -13,7 +13,7 @@ MAX_PARAMETERS = 12
 MAX_KERNEL_LINES = 60
 RUNTIME = "octoseg_ti/device/runtime.py"
 EMPTY_NAMES = {"utils.py", "util.py", "common.py", "helpers.py", "misc.py"}
-OPTIONAL_PACKAGES = {"laspy", "pye57"}
+OPTIONAL_PACKAGES = {"laspy", "pye57", "OCP"}
 
 _ARRAY = re.compile(r"^[FIU](8|16|32|64)[A-Z]\w*$")  # F64Rows, I32Array ...
 _SUFFIX = ("_in", "_out", "_inout")

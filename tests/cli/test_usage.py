@@ -45,7 +45,7 @@ def test_every_option_has_a_help_text(verb: str) -> None:
 
     options = import_module(f"octoseg_ti.cli.{VERBS[verb][0]}").OPTIONS[verb]
     docs = _field_docs(options)
-    nested = {"machine", "params", "scanner"}
+    nested = {"machine", "params", "scanner", "solid"}
     for item in dataclasses.fields(options):
         assert item.name in nested or docs.get(item.name), f"{verb}: {item.name}"
 
@@ -72,6 +72,8 @@ def test_every_option_has_a_help_text(verb: str) -> None:
         (["simulate", "test-block"], ["missing", "--output"]),
         (["simulate", "test-blok", "-o", "c.mcap"], ["did you mean 'test-block'", "phone"]),
         (["simulate", "two-planes", "-o", "c.step"], [".step", ".mcap"]),
+        (["simulate", "part.docx", "-o", "c.mcap"], ["part.docx", "test-block", ".step .stp .stl"]),
+        (["simulate", "part.stl", "-o", "c.mcap", "--unit", "yard"], ["yard", "inch"]),
         (["evaluate"], ["missing FILE"]),
         (["evaluate", __file__, "--overlap", "0.4"], ["--overlap", "0.5"]),
         (["profile", __file__, "--repeat", "0"], ["--repeat"]),
