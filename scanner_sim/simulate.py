@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from octoseg_ti.errors import DataError
 from octoseg_ti.types import Scans, Truth
+from scanner_sim.poses import with_pose_errors
 from scanner_sim.quadric import gradient
 from scanner_sim.raycast import cast
 from scanner_sim.scanner import DEFAULT_VIEWS, StripeScanner, View
@@ -116,7 +118,8 @@ def simulate(
         },
     )
     report("truth", 1.0)
-    return scans, truth
+    truth = replace(truth, T_world_view=scans.T_world_view)
+    return with_pose_errors(scans, scanner, seed), truth
 
 
 def _pitches(
@@ -152,13 +155,13 @@ def _extent(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return lowest and highest stage and ray position that meet the part's box, shape (3,) each.
 
-    x = stage, y = where the ray meets the plane z = 0, z = height; all in the frame of the view
-    [mm].
+    x = stage, y = where the ray meets the plane z = 0, seen from the laser, z = height; all in the
+    frame of the view [mm].
     """
     middle = limits.mean(axis=0)
     corners = np.array([[limits[i, 0], limits[j, 1], limits[k, 2]]
                         for i in (0, 1) for j in (0, 1) for k in (0, 1)])  # fmt: skip
-    local = (corners - middle) @ view.rotation()
+    local = (corners - middle) @ view.rotation() - (0.0, view.offset, 0.0)
     if local[:, 2].max() >= scanner.stand_off:
         raise DataError(
             f"the part reaches the probe: its box ends {local[:, 2].max():.0f} mm above its "
@@ -188,7 +191,7 @@ def _scan(
     x = _spread(low[0], high[0], across)
     y = _spread(low[1], high[1], along)
     stripes, columns = len(x), len(y)
-    source = np.stack([x, np.zeros(stripes), np.full(stripes, scanner.stand_off)], axis=1)
+    source = np.stack([x, np.full(stripes, view.offset), np.full(stripes, scanner.stand_off)], axis=1)
     ray = np.stack([np.zeros(columns), y, np.full(columns, -scanner.stand_off)], axis=1)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     source_world = source @ rotation.T + middle
