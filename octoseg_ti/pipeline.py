@@ -193,9 +193,7 @@ def register(
     return point, normal, aligned
 
 
-def with_registration(
-    result: Segmentation, scans: Scans, aligned: Registration
-) -> Segmentation:
+def with_registration(result: Segmentation, scans: Scans, aligned: Registration) -> Segmentation:
     """Return the result with its registration; points left out move with their views too."""
     out = np.flatnonzero(result.outlier)
     if len(out) and scans.view is not None:

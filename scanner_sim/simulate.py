@@ -191,7 +191,9 @@ def _scan(
     x = _spread(low[0], high[0], across)
     y = _spread(low[1], high[1], along)
     stripes, columns = len(x), len(y)
-    source = np.stack([x, np.full(stripes, view.offset), np.full(stripes, scanner.stand_off)], axis=1)
+    source = np.stack(
+        [x, np.full(stripes, view.offset), np.full(stripes, scanner.stand_off)], axis=1
+    )
     ray = np.stack([np.zeros(columns), y, np.full(columns, -scanner.stand_off)], axis=1)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     source_world = source @ rotation.T + middle

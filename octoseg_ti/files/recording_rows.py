@@ -135,7 +135,7 @@ def joined(pieces: list[Truth]) -> Truth:
         values = [getattr(piece, name) for piece in pieces]
         if all(value is not None for value in values):
             fields[name] = np.concatenate(values)
-    return Truth(info=pieces[0].info, **fields)
+    return Truth(info=pieces[0].info, T_world_view=pieces[0].T_world_view, **fields)
 
 
 def _truth_dtype(truth: Truth, position: str) -> np.dtype:

@@ -1,9 +1,10 @@
 """Stage 3, on request: align overlapping views to each other, from the recorded poses on (I6).
 
-Pairs of views are aligned by generalised ICP (Segal, Haehnel & Thrun, "Generalized-ICP", RSS 2009)
-through small_gicp; a graph over all pairs makes one motion of every view out of these, and joint
-steps from point to plane over all pairs at once (the symmetric objective of Rusinkiewicz, ACM Trans.
-Graph. 38(4), 2019) bring it home. Points near edges, where a normal is none, take no part.
+Pairs of views are aligned by generalised ICP (Segal, Haehnel & Thrun, "Generalized-ICP", RSS
+2009) through small_gicp; a graph over all pairs makes one motion of every view out of these, and
+joint steps from point to plane over all pairs at once (the symmetric objective of Rusinkiewicz,
+ACM Trans. Graph. 38(4), 2019) bring it home. Points near edges, where a normal is none, take no
+part.
 
 All motions here are small twists (rotation vector times the radius of the points, shift) about the
 middle of the points, so that the six numbers have one unit: mm.
@@ -271,7 +272,7 @@ def _solve(
     twists, loose = np.zeros((count, 6)), np.zeros(count, np.int32)
     if len(free) == 0:
         return twists, loose
-    block = system[np.ix_(free, range(6), free, range(6))].reshape(6 * len(free), -1)
+    block = system[free][:, :, free].reshape(6 * len(free), -1)
     # Views of many and of few points get one scale, so that one limit fits all.
     size = np.sqrt(np.maximum(np.diag(block).reshape(-1, 6).sum(axis=1), 1e-300)).repeat(6)
     values, axes = np.linalg.eigh(block / size[:, None] / size[None, :])
@@ -340,7 +341,9 @@ def _jointly(
     loose = np.zeros(len(fixed), np.int32)
     for _ in range(_ROUNDS):
         equations = [
-            _equations(_match(views[i], views[j], motion[[i, j]], _near(views, i, j, reach)), radius)
+            _equations(
+                _match(views[i], views[j], motion[[i, j]], _near(views, i, j, reach)), radius
+            )
             for i, j in pairs
         ]
         twists, loose = _solve(pairs, equations, fixed)
