@@ -1,5 +1,15 @@
 """A stripe laser scanner that knows the truth.
 
+    from scanner_sim import StripeScanner, blocks, plan_views, scan_views, simulate
+
+    part = blocks.test_block()
+    scans, truth = simulate(part, StripeScanner(range_noise=0.02), seed=7)
+
+    views = plan_views(part, overlap=0.3)              # indexed orientations that cover the part
+    scanner = StripeScanner(stripe_pitch=0.1, views=views)
+    for scans in scan_views(part, scanner, seed=7, truth=False):
+        print(scans.view[0], len(scans))               # one pass at a time, in bounded memory
+
 Names are resolved when they are first used, so that importing the package loads no Taichi.
 """
 
@@ -10,17 +20,23 @@ if TYPE_CHECKING:
     from scanner_sim import blocks
     from scanner_sim.part import Part, box, cone, cylinder, half_space, rod, sphere, torus
     from scanner_sim.scanner import StripeScanner, View
-    from scanner_sim.simulate import simulate
+    from scanner_sim.simulate import ScanStream, scan_views, simulate
+    from scanner_sim.views import ProbeHead, parse_views, plan_views
 
 _HOME = {
     "Part": "part",
+    "ProbeHead": "views",
+    "ScanStream": "simulate",
     "StripeScanner": "scanner",
     "View": "scanner",
     "box": "part",
     "cone": "part",
     "cylinder": "part",
     "half_space": "part",
+    "parse_views": "views",
+    "plan_views": "views",
     "rod": "part",
+    "scan_views": "simulate",
     "simulate": "simulate",
     "sphere": "part",
     "torus": "part",
@@ -28,6 +44,8 @@ _HOME = {
 
 __all__ = [
     "Part",
+    "ProbeHead",
+    "ScanStream",
     "StripeScanner",
     "View",
     "blocks",
@@ -35,7 +53,10 @@ __all__ = [
     "cone",
     "cylinder",
     "half_space",
+    "parse_views",
+    "plan_views",
     "rod",
+    "scan_views",
     "simulate",
     "sphere",
     "torus",

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from octoseg_ti.types import Scans
     from scanner_sim.scanner import StripeScanner
 
 _CHILD = 1_000_000  # child of the seed that draws the poses: beyond the numbers of all views
@@ -40,37 +38,28 @@ def pose_errors(count: int, noise: float, angle: float, seed: int) -> np.ndarray
     return motions
 
 
-def with_pose_errors(scans: Scans, scanner: StripeScanner, seed: int) -> Scans:
-    """Return scans whose recorded poses, and probe positions with them, are a little wrong.
+def recorded_poses(true: np.ndarray, scanner: StripeScanner, seed: int) -> np.ndarray:
+    """Return the poses that the scanner records, shape (V, 4, 4): the true ones with its errors.
 
     Args:
-        scans: Scans in the frames of their views, with true poses.
-        scanner: Tells the size of the errors; without any the scans come back as they are.
+        true: True poses, view to world, shape (V, 4, 4).
+        scanner: Tells the size of the errors; without any the poses come back as they are.
         seed: Seed of the scan.
     """
     if scanner.pose_noise == 0.0 and scanner.pose_angle_noise == 0.0:
-        return scans
-    true, stripe, view = scans.T_world_view, scans.stripe, scans.view
-    assert true is not None and stripe is not None and view is not None
+        return true
     errors = pose_errors(len(true), scanner.pose_noise, scanner.pose_angle_noise, seed)
-    recorded = true @ errors
+    recorded: np.ndarray = np.einsum("vij,vjk->vik", true, errors)
+    return recorded
+
+
+def as_recorded(points: np.ndarray, true: np.ndarray, recorded: np.ndarray) -> np.ndarray:
+    """Return true world positions (N, 3) where a view of this recorded pose believes them."""
+    if np.array_equal(true, recorded):
+        return points
     shift = recorded @ np.linalg.inv(true)
-    origin, stripe_origin = scans.origin, scans.stripe_origin
-    if origin is not None:
-        origin = _moved(shift, origin)
-    if stripe_origin is not None:
-        # The view of a stripe, also of one that has lost all its points.
-        last = np.full(len(true), -1)
-        np.maximum.at(last, view, stripe)
-        owner = np.searchsorted(np.maximum.accumulate(last), np.arange(len(stripe_origin)))
-        stripe_origin = _moved(shift[np.minimum(owner, len(true) - 1)], stripe_origin)
-    return replace(scans, T_world_view=recorded, origin=origin, stripe_origin=stripe_origin)
-
-
-def _moved(motions: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return points (N, 3), each moved by its own motion (N, 4, 4)."""
-    turned: np.ndarray = np.einsum("nij,nj->ni", motions[:, :3, :3], points)
-    return turned + motions[:, :3, 3]
+    moved: np.ndarray = np.einsum("ij,nj->ni", shift[:3, :3], points) + shift[:3, 3]
+    return moved
 
 
 def _rotations(vectors: np.ndarray) -> np.ndarray:
