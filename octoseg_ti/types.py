@@ -223,7 +223,8 @@ class Registration:
         Returns:
             Shift of the origin of the view [mm] and angle [rad], shape (V,) each.
         """
-        change = np.linalg.inv(self.recorded) @ self.refined
+        moved = (self.refined != self.recorded).any(axis=(1, 2))[:, None, None]
+        change = np.where(moved, np.linalg.inv(self.recorded) @ self.refined, np.eye(4))
         # The sine of a small angle, from the skew part, is exact where the cosine is not.
         skew = change[:, :3, :3] - change[:, :3, :3].transpose(0, 2, 1)
         sine = np.linalg.norm(skew, axis=(1, 2)) / np.sqrt(8.0)

@@ -15,7 +15,7 @@ from octoseg_ti.cli.output import out, out_json, progress, size_of
 from octoseg_ti.params import PRESETS, Params
 
 if TYPE_CHECKING:
-    from octoseg_ti.types import Registration, Segmentation
+    from octoseg_ti.types import Registration, Segmentation, Truth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,9 +100,17 @@ def run_segment(options: SegmentOptions) -> int:
         return 0
     if options.json:
         outputs = {"outputs": options.output, "total_seconds": whole}
-        out_json({"input": options.input, **summary(result), **outputs})
+        figures = {**summary(result), "pose_errors": pose_figures(result, truth)}
+        out_json({"input": options.input, **figures, **outputs})
     else:
         out(str(result))
+        errors = pose_figures(result, truth)
+        if errors is not None:
+            out(
+                f"  relative poses against the truth, at most: recorded "
+                f"{errors['recorded_mm']:.4f} mm {errors['recorded_deg']:.4f} deg, refined "
+                f"{errors['refined_mm']:.4f} mm {errors['refined_deg']:.4f} deg"
+            )
         for path in options.output:
             out(f"wrote {path} ({size_of(path)})")
     return 0
@@ -139,6 +147,19 @@ def summary(result: Segmentation) -> dict[str, Any]:
         "params": result.params.to_dict(),
         "seconds": result.seconds,
     }
+
+
+def pose_figures(result: Segmentation, truth: Truth | None) -> dict[str, Any] | None:
+    """Return how far relative poses are from the true ones; None where either is not known."""
+    if result.registration is None or truth is None or truth.T_world_view is None:
+        return None
+    from octoseg_ti.evaluation import pose_errors
+
+    figures = {}
+    for name in ("recorded", "refined"):
+        shift, angle = pose_errors(getattr(result.registration, name), truth.T_world_view)
+        figures[f"{name}_mm"], figures[f"{name}_deg"] = shift, float(np.degrees(angle))
+    return figures
 
 
 def registration_figures(aligned: Registration | None) -> dict[str, Any] | None:

@@ -21,13 +21,20 @@ from octoseg_ti.types import Registration
 
 _MOST = 100_000
 """Points of a view that take part at most; more are thinned evenly."""
+_START = 10_000
+"""... and for the start by ICP, which only has to come near."""
 _NEIGHBORS = 9
 _AGREE = np.cos(np.radians(20.0))
 """Partners whose normals differ by more lie on different faces."""
 _LEAST = 50
 """Fewer matches are no overlap."""
-_OPEN = 1e-3
+_OPEN = 2e-3
 """A direction is open where the normals' share along it (mean square) is below this."""
+_PARTNERS = 4
+"""Partners of a point in the joint steps. With one, some points of the other view would count
+several times and others never, and their noise would not average out."""
+_NEAR = 1.75
+"""Farthest partner in the joint steps, in spacings."""
 _ROUNDS = 25
 _STILL = 2e-5
 """Steps below this end the rounds [mm]."""
@@ -109,17 +116,24 @@ def refine_poses(
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
     views = [_smooth_points(points[view == v] - middle, normals[view == v]) for v in range(count)]
     radius = _radius(views)
-    motion = np.tile(np.eye(4), (count, 1, 1))
+    still = np.tile(np.eye(4), (count, 1, 1))
     pairs = _overlapping(views, reach, overlap)
-    datum, left, fixed = _groups(pairs, count)
-    loose = np.zeros(count, np.int32)
-    before = _residuals(views, pairs, motion, reach)[1]
-    if pairs:
+    while True:
+        datum, left, fixed = _groups(pairs, count)
+        motion, loose = still, np.zeros(count, np.int32)
+        if not pairs:
+            break
         started = _aligned_pairs(small_gicp, views, pairs, reach, radius, fixed)
         # A pair that has slid away must not spoil the start.
-        if _cost(views, pairs, started, reach) < _cost(views, pairs, motion, reach):
+        if _cost(views, pairs, started, reach) < _cost(views, pairs, still, reach):
             motion = started
         motion, loose = _jointly(views, pairs, motion, reach, radius, fixed)
+        # The overlaps were found within reach; what claims to lie farther off has lost its hold.
+        lost = _displacement(motion, radius) > reach
+        if not lost.any():
+            break
+        pairs = [(i, j) for i, j in pairs if not (lost[i] or lost[j])]
+    before = _residuals(views, pairs, still, reach)[1]
     matches, after = _residuals(views, pairs, motion, reach)
     shift = np.tile(np.eye(4), (count, 1, 1))
     shift[:, :3, 3] = middle
@@ -162,7 +176,9 @@ def _radius(views: list[_View]) -> float:
     return float(np.sqrt(squares / number)) if squares > 0.0 else 1.0
 
 
-def _match(first: _View, second: _View, moves: np.ndarray, reach: float) -> _Matches:
+def _match(
+    first: _View, second: _View, moves: np.ndarray, reach: float, partners: int = 1
+) -> _Matches:
     """Return what matches between two views, each point of either with its nearest in the other.
 
     Args:
@@ -170,14 +186,19 @@ def _match(first: _View, second: _View, moves: np.ndarray, reach: float) -> _Mat
         second: The other.
         moves: Their motions, shape (2, 4, 4).
         reach: Farthest partner [mm].
+        partners: How many nearest points of the other view a point is matched with; points with
+            fewer are left out.
     """
     places, facing, gaps, spread = [], [], [], []
     for sign, (a, b), (p, q) in ((1.0, (first, second), (0, 1)), (-1.0, (second, first), (1, 0))):
         change = np.linalg.inv(moves[q]) @ moves[p]
         carried = _carry(change, a.points)
-        distance, partner = b.tree.query(carried, distance_upper_bound=reach, workers=-1)
-        here = np.flatnonzero(np.isfinite(distance))
-        partner = partner[here]
+        distance, partner = b.tree.query(
+            carried, range(1, partners + 1), distance_upper_bound=reach, workers=-1
+        )
+        # A point with fewer partners lies on the rim of the other view, where normals lean inward.
+        here = np.flatnonzero(np.isfinite(distance[:, -1])).repeat(partners)
+        partner = partner[np.isfinite(distance[:, -1])].ravel()
         n = np.einsum("ij,nj->ni", change[:3, :3], a.normals[here])
         m = b.normals[partner]
         agree = np.einsum("ij,ij->i", n, m) >= _AGREE
@@ -296,6 +317,12 @@ def _twisted(motion: np.ndarray, twists: np.ndarray, radius: float) -> np.ndarra
     return np.where(still[:, None, None], motion, step @ motion)
 
 
+def _displacement(motion: np.ndarray, radius: float) -> np.ndarray:
+    """Return how far motions carry points at most, in root mean square over the part [mm]."""
+    turn = np.linalg.norm(motion[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(2.0)
+    return np.hypot(np.linalg.norm(motion[:, :3, 3], axis=1), turn * radius)
+
+
 def _aligned_pairs(
     small_gicp: Any,
     views: list[_View],
@@ -310,7 +337,8 @@ def _aligned_pairs(
     still = np.tile(np.eye(4), (2, 1, 1))
     clouds: dict[int, Any] = {}
     for v in sorted({v for pair in pairs for v in pair}):
-        cloud = small_gicp.PointCloud(views[v].points)
+        step = -(-len(views[v].points) // _START)
+        cloud = small_gicp.PointCloud(np.ascontiguousarray(views[v].points[::step]))
         tree = small_gicp.KdTree(cloud)  # one thread: the same tree in every run
         small_gicp.estimate_normals_covariances(cloud, tree, num_neighbors=20, num_threads=1)
         clouds[v] = (cloud, tree)
@@ -355,7 +383,7 @@ def _jointly(
 
 def _near(views: list[_View], i: int, j: int, reach: float) -> float:
     """Return how far a partner may be once the views lie on each other [mm]."""
-    return min(reach, 1.5 * max(views[i].spacing, views[j].spacing))
+    return min(reach, _NEAR * max(views[i].spacing, views[j].spacing))
 
 
 def _residuals(
