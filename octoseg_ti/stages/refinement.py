@@ -24,17 +24,18 @@ _MOST = 100_000
 _START = 10_000
 """... and for the start by ICP, which only has to come near."""
 _NEIGHBORS = 9
+_RIM = 0.25
+"""A point is on the rim of its view when the mean of its neighbours lies this share of their
+distance aside."""
 _AGREE = np.cos(np.radians(20.0))
 """Partners whose normals differ by more lie on different faces."""
 _LEAST = 50
 """Fewer matches are no overlap."""
-_OPEN = 2e-3
+_OPEN = 5e-4
 """A direction is open where the normals' share along it (mean square) is below this."""
-_PARTNERS = 4
-"""Partners of a point in the joint steps. With one, some points of the other view would count
-several times and others never, and their noise would not average out."""
-_NEAR = 1.75
-"""Farthest partner in the joint steps, in spacings."""
+_NEAR = 0.75
+"""Farthest partner in the joint steps, in spacings: a farther one lies beyond the rim of the
+overlap, and what is wrong with its normal counts with its distance."""
 _ROUNDS = 25
 _STILL = 2e-5
 """Steps below this end the rounds [mm]."""
@@ -161,7 +162,10 @@ def _smooth_points(points: np.ndarray, normals: np.ndarray) -> _View:
     length = np.sqrt(np.einsum("ij,ij->i", mean, mean))
     # Noise alone shortens the mean by its variance, an edge by far more.
     least = 1.0 - max(0.005, 3.0 * (1.0 - float(np.median(length))))
-    smooth = np.flatnonzero(length >= least)
+    # On the rim of a view all neighbours lie to one side, and the mean normal leans to that side.
+    aside = points[near].mean(axis=1) - points
+    aside = np.sqrt(np.einsum("ij,ij->i", aside, aside))
+    smooth = np.flatnonzero((length >= least) & (aside <= _RIM * distance[:, -1]))
     if len(smooth) == 0:
         return _View(np.empty((0, 3)), np.empty((0, 3)), None, 0.0)
     points = np.ascontiguousarray(points[smooth])
@@ -176,9 +180,7 @@ def _radius(views: list[_View]) -> float:
     return float(np.sqrt(squares / number)) if squares > 0.0 else 1.0
 
 
-def _match(
-    first: _View, second: _View, moves: np.ndarray, reach: float, partners: int = 1
-) -> _Matches:
+def _match(first: _View, second: _View, moves: np.ndarray, reach: float) -> _Matches:
     """Return what matches between two views, each point of either with its nearest in the other.
 
     Args:
@@ -186,19 +188,14 @@ def _match(
         second: The other.
         moves: Their motions, shape (2, 4, 4).
         reach: Farthest partner [mm].
-        partners: How many nearest points of the other view a point is matched with; points with
-            fewer are left out.
     """
     places, facing, gaps, spread = [], [], [], []
     for sign, (a, b), (p, q) in ((1.0, (first, second), (0, 1)), (-1.0, (second, first), (1, 0))):
         change = np.linalg.inv(moves[q]) @ moves[p]
         carried = _carry(change, a.points)
-        distance, partner = b.tree.query(
-            carried, range(1, partners + 1), distance_upper_bound=reach, workers=-1
-        )
-        # A point with fewer partners lies on the rim of the other view, where normals lean inward.
-        here = np.flatnonzero(np.isfinite(distance[:, -1])).repeat(partners)
-        partner = partner[np.isfinite(distance[:, -1])].ravel()
+        distance, partner = b.tree.query(carried, distance_upper_bound=reach, workers=-1)
+        here = np.flatnonzero(np.isfinite(distance))
+        partner = partner[here]
         n = np.einsum("ij,nj->ni", change[:3, :3], a.normals[here])
         m = b.normals[partner]
         agree = np.einsum("ij,ij->i", n, m) >= _AGREE
@@ -255,6 +252,8 @@ def _groups(pairs: list[tuple[int, int]], count: int) -> tuple[np.ndarray, np.nd
 
 def _equations(found: _Matches, radius: float) -> _Equations:
     """Return the normal equations of a pair, with robust weights and without open directions."""
+    if len(found.gap) == 0:
+        return _Equations(np.zeros((6, 6)), np.zeros(6), np.eye(6))
     middle = float(np.median(found.gap))
     scale = 1.4826 * float(np.median(np.abs(found.gap - middle)))
     # The gaps may all be large before the first step, so the scale counts from zero as well.
@@ -367,16 +366,16 @@ def _jointly(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the motions after joint steps from point to plane, and the directions left open."""
     loose = np.zeros(len(fixed), np.int32)
-    for _ in range(_ROUNDS):
-        equations = [
-            _equations(
-                _match(views[i], views[j], motion[[i, j]], _near(views, i, j, reach)), radius
-            )
-            for i, j in pairs
-        ]
+    for number in range(_ROUNDS):
+        least = reach * 0.5**number
+        equations = []
+        for i, j in pairs:
+            near = _near(views, i, j, reach)
+            found = _match(views[i], views[j], motion[[i, j]], max(near, least))
+            equations.append(_equations(found, radius))
         twists, loose = _solve(pairs, equations, fixed)
         motion = _twisted(motion, twists, radius)
-        if float(np.abs(twists).max(initial=0.0)) < _STILL:
+        if least <= near and float(np.abs(twists).max(initial=0.0)) < _STILL:
             break
     return motion, loose
 
@@ -392,7 +391,7 @@ def _residuals(
     """Return number of matches and root mean square distance [mm] of every pair, shape (P,)."""
     count, rms = [], []
     for i, j in pairs:
-        found = _match(views[i], views[j], motion[[i, j]], _near(views, i, j, reach))
+        found = _match(views[i], views[j], motion[[i, j]], reach)
         count.append(len(found.gap))
         mean = float(np.einsum("i,i->", found.gap, found.gap)) / max(len(found.gap), 1)
         rms.append(np.sqrt(mean) if len(found.gap) else np.nan)
