@@ -13,6 +13,7 @@
 Names are resolved when they are first used, so that importing the package loads no Taichi.
 """
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -66,9 +67,12 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import a public name from the module that holds it."""
     if name in _HOME:
-        value = getattr(import_module(f"scanner_sim.{_HOME[name]}"), name)
-        # The import has bound the module `simulate` to the package; the function must win.
-        globals()[name] = value
+        module = import_module(f"scanner_sim.{_HOME[name]}")
+        value = globals()[name] = getattr(module, name)
+        # The import may have bound the module `simulate` to the package; the function must win.
+        simulating = sys.modules.get("scanner_sim.simulate")
+        if simulating is not None and hasattr(simulating, "simulate"):
+            globals()["simulate"] = simulating.simulate
         return value
     if name == "blocks":
         return import_module("scanner_sim.blocks")

@@ -239,8 +239,6 @@ def _spread_samples(flat: FlatPart, limits: np.ndarray, scanner: StripeScanner) 
     Parallel rays from many sides meet the part; of the places one is kept for each small cube and
     side, so that no face counts more because more rays happened to meet it.
     """
-    if not np.isfinite(limits).all():
-        raise DataError("the part is unbounded", hint="cut it with a box")
     middle = limits.mean(axis=0)
     radius = float(np.linalg.norm(limits[1] - limits[0])) / 2.0
     rng = np.random.default_rng(_SEED)

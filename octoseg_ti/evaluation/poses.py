@@ -17,7 +17,7 @@ def pose_errors(T_world_view: np.ndarray, true: np.ndarray) -> tuple[float, floa
         true: True poses, shape (V, 4, 4).
 
     Returns:
-        Distance between the origins of views [mm], and angle [rad]; 0 for a single view.
+        Shift of the origin of a view as the other sees it [mm], and angle [rad]; 0 for one view.
 
     Raises:
         DataError: The numbers of views differ.
@@ -27,7 +27,9 @@ def pose_errors(T_world_view: np.ndarray, true: np.ndarray) -> tuple[float, floa
     shift = angle = 0.0
     back, true_back = np.linalg.inv(T_world_view), np.linalg.inv(true)
     for i in range(len(true)):
-        for j in range(i):
+        for j in range(len(true)):
+            if i == j:
+                continue
             error = np.linalg.inv(true_back[i] @ true[j]) @ (back[i] @ T_world_view[j])
             shift = max(shift, float(np.linalg.norm(error[:3, 3])))
             # Half the skew part has the length of the sine: exact for small angles.

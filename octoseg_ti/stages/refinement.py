@@ -31,8 +31,12 @@ _AGREE = np.cos(np.radians(20.0))
 """Partners whose normals differ by more lie on different faces."""
 _LEAST = 50
 """Fewer matches are no overlap."""
-_OPEN = 5e-4
+_OPEN = 1e-3
 """A direction is open where the normals' share along it (mean square) is below this."""
+_MOST_OPEN = 0.05
+"""... and at most below this, where a lower bound has let a view slide."""
+_SLIDE = 4.0
+"""A view that moves by more than this many times its largest gap has slid."""
 _NEAR = 0.75
 """Farthest partner in the joint steps, in spacings: a farther one lies beyond the rim of the
 overlap, and what is wrong with its normal counts with its distance."""
@@ -119,21 +123,27 @@ def refine_poses(
     radius = _radius(views)
     still = np.tile(np.eye(4), (count, 1, 1))
     pairs = _overlapping(views, reach, overlap)
+    least = _OPEN
     while True:
         datum, left, fixed = _groups(pairs, count)
         motion, loose = still, np.zeros(count, np.int32)
         if not pairs:
             break
-        started = _aligned_pairs(small_gicp, views, pairs, reach, radius, fixed)
+        started = _aligned_pairs(small_gicp, views, pairs, reach, radius, fixed, least)
         # A pair that has slid away must not spoil the start.
         if _cost(views, pairs, started, reach) < _cost(views, pairs, still, reach):
             motion = started
-        motion, loose = _jointly(views, pairs, motion, reach, radius, fixed)
-        # The overlaps were found within reach; what claims to lie farther off has lost its hold.
-        lost = _displacement(motion, radius) > reach
+        motion, loose = _jointly(views, pairs, motion, reach, radius, fixed, least)
+        # A view that moves by far more than the gaps that it had has slid along a direction that is
+        # open in truth, and looks held by what is wrong with some normals.
+        gaps = _residuals(views, pairs, still, reach)[1]
+        lost = _displacement(motion, radius) > min(reach, _SLIDE * float(gaps.max()) + 1e-3)
         if not lost.any():
             break
-        pairs = [(i, j) for i, j in pairs if not (lost[i] or lost[j])]
+        if least < _MOST_OPEN:
+            least *= 3.0
+        else:
+            pairs = [(i, j) for i, j in pairs if not (lost[i] or lost[j])]
     before = _residuals(views, pairs, still, reach)[1]
     matches, after = _residuals(views, pairs, motion, reach)
     shift = np.tile(np.eye(4), (count, 1, 1))
@@ -250,7 +260,7 @@ def _groups(pairs: list[tuple[int, int]], count: int) -> tuple[np.ndarray, np.nd
     return datum.astype(np.int32), left.astype(np.int32), first | ~paired
 
 
-def _equations(found: _Matches, radius: float) -> _Equations:
+def _equations(found: _Matches, radius: float, least: float = _OPEN) -> _Equations:
     """Return the normal equations of a pair, with robust weights and without open directions."""
     if len(found.gap) == 0:
         return _Equations(np.zeros((6, 6)), np.zeros(6), np.eye(6))
@@ -265,9 +275,9 @@ def _equations(found: _Matches, radius: float) -> _Equations:
     right = np.einsum("n,ni,n->i", weight, jacobian, found.gap)
     share, axes = np.linalg.eigh(matrix / max(float(weight.sum()), 1e-300))
     # Noise of the normals looks like a little curvature; what is not clearly more is open.
-    closed = axes[:, share >= max(_OPEN, found.spread)]
+    closed = axes[:, share >= max(least, found.spread)]
     projector = closed @ closed.T
-    loose = axes[:, share < max(_OPEN, found.spread)]
+    loose = axes[:, share < max(least, found.spread)]
     return _Equations(projector @ matrix @ projector, projector @ right, loose)
 
 
@@ -329,6 +339,7 @@ def _aligned_pairs(
     reach: float,
     radius: float,
     fixed: np.ndarray,
+    least: float,
 ) -> np.ndarray:
     """Return the motions that agree best with the ICP of every pair, shape (V, 4, 4)."""
     from scipy.spatial.transform import Rotation
@@ -350,7 +361,7 @@ def _aligned_pairs(
         )  # fmt: skip
         change = np.asarray(found.T_target_source)
         turn = Rotation.from_matrix(change[:3, :3]).as_rotvec() * radius
-        pair = _equations(_match(views[i], views[j], still, reach), radius)
+        pair = _equations(_match(views[i], views[j], still, reach), radius, least)
         right = np.einsum("ij,j->i", pair.matrix, np.concatenate([turn, change[:3, 3]]))
         wanted.append(pair._replace(right=right))
     return _twisted(np.tile(np.eye(4), (len(fixed), 1, 1)), _solve(pairs, wanted, fixed)[0], radius)
@@ -363,19 +374,20 @@ def _jointly(
     reach: float,
     radius: float,
     fixed: np.ndarray,
+    least: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the motions after joint steps from point to plane, and the directions left open."""
     loose = np.zeros(len(fixed), np.int32)
     for number in range(_ROUNDS):
-        least = reach * 0.5**number
+        wide = reach * 0.5**number
         equations = []
         for i, j in pairs:
             near = _near(views, i, j, reach)
-            found = _match(views[i], views[j], motion[[i, j]], max(near, least))
-            equations.append(_equations(found, radius))
+            found = _match(views[i], views[j], motion[[i, j]], max(near, wide))
+            equations.append(_equations(found, radius, least))
         twists, loose = _solve(pairs, equations, fixed)
         motion = _twisted(motion, twists, radius)
-        if least <= near and float(np.abs(twists).max(initial=0.0)) < _STILL:
+        if wide <= near and float(np.abs(twists).max(initial=0.0)) < _STILL:
             break
     return motion, loose
 
