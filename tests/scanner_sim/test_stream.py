@@ -68,7 +68,7 @@ def test_a_recording_written_in_parts_holds_the_same(tmp_path) -> None:
         writer.add_truth(stream.truth)
     assert check(path) == []
     files.write(tmp_path / "whole.mcap", scans, truth=truth)
-    assert_equal(files.read(path), files.read(tmp_path / "whole.mcap"))
+    assert_equal(files.read(path), files.read(tmp_path / "whole.mcap"), but=("name",))
     there, known = files.read_truth(path), files.read_truth(tmp_path / "whole.mcap")
     assert_equal(there, known)
     assert there is not None
