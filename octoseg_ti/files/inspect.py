@@ -178,7 +178,7 @@ def _recording_problems(path: Path) -> list[str]:
     contents = collect(path, None)
     factory = DecoderFactory()
     decoders: dict[int, Any] = {}
-    latest: dict[int, int] = {}
+    latest = {False: -1, True: -1}
     back = 0
     sequence: dict[int, int] = {}
     unordered: dict[str, int] = {}
@@ -207,9 +207,10 @@ def _recording_problems(path: Path) -> list[str]:
                 decoder(message.data)
             except DecodeError:
                 undecodable[channel.topic] = undecodable.get(channel.topic, 0) + 1
-        # Truth that follows its scan starts again at time 0: order is a matter of each topic.
-        back += message.log_time < latest.get(message.channel_id, -1)
-        latest[message.channel_id] = max(latest.get(message.channel_id, -1), message.log_time)
+        # Truth may follow its scan, and then starts again at time 0.
+        of_truth = channel.topic == "/truth/lines"
+        back += message.log_time < latest[of_truth]
+        latest[of_truth] = max(latest[of_truth], message.log_time)
         if channel.topic in ("/scan/lines", "/truth/lines"):
             if not seen_transform:
                 problems.append(f"no transform comes before the first cloud of {channel.topic}")
@@ -219,7 +220,7 @@ def _recording_problems(path: Path) -> list[str]:
             sequence[message.channel_id] = message.sequence
         seen_transform = seen_transform or schema.startswith("foxglove.FrameTransform")
     if back:
-        problems.append(f"{back} messages are older than the one before in their topic")
+        problems.append(f"{back} messages are older than the one before")
     problems += [f"{n} messages of {topic} cannot be decoded" for topic, n in undecodable.items()]
     problems += [f"{n} stripes of {topic} are out of order" for topic, n in unordered.items()]
     return problems
