@@ -18,6 +18,8 @@ CELL_SPACINGS = 1.8
 """Smallest cell in point spacings: about three points in a cell."""
 GAP_SPACINGS = 3.0
 """A strip of triangles breaks where an edge is longer than this many spacings."""
+REACH_SPACINGS = 3.0
+"""A point finds its partner in another view within this many spacings."""
 SPIKE_SPACINGS = 2.0
 """A spike stands off from its neighbours by this many spacings: the corner point of a sharp edge
 stands off by 0.7 at most."""
@@ -52,6 +54,9 @@ def derive(params: Params, measured: Measurement) -> Params:
         cleaning = replace(cleaning, isolation=ISOLATION_SPACINGS * spacing)
     if normals.gap is None:
         normals = replace(normals, gap=GAP_SPACINGS * spacing)
+    registration = params.registration
+    if registration.reach is None:
+        registration = replace(registration, reach=REACH_SPACINGS * spacing)
     if grid.tolerance is None:
         floor = NOISE_FLOORS * measured.normal_noise
         grid = replace(grid, tolerance=min(1.0, max(LEAST_TOLERANCE, floor)))
@@ -68,4 +73,11 @@ def derive(params: Params, measured: Measurement) -> Params:
         area = PATCH_CELLS * (CELL_SPACINGS * spacing) ** 2
         one = measured.spacing_along * measured.spacing_across
         regions = replace(regions, min_points=max(3, round(area / one)) if one > 0 else 3)
-    return replace(params, cleaning=cleaning, normals=normals, grid=grid, regions=regions)
+    return replace(
+        params,
+        cleaning=cleaning,
+        normals=normals,
+        registration=registration,
+        grid=grid,
+        regions=regions,
+    )

@@ -41,6 +41,18 @@ class NormalParams:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RegistrationParams:
+    """Alignment of the views to each other (I6)."""
+
+    refine: bool = False
+    """Align overlapping views by ICP, from the recorded poses on. Needs the extra "icp"."""
+    reach: float | None = None
+    """Farthest partner of a point in another view [mm]; default: from the spacing."""
+    overlap: float = 0.05
+    """Least share of the smaller of two views that must have partners in the other, 0..1."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GridParams:
     """The sparse octree of normals (G1-G8)."""
 
@@ -90,6 +102,7 @@ class Params:
 
     cleaning: CleaningParams = field(default_factory=CleaningParams)
     normals: NormalParams = field(default_factory=NormalParams)
+    registration: RegistrationParams = field(default_factory=RegistrationParams)
     grid: GridParams = field(default_factory=GridParams)
     edges: EdgeParams = field(default_factory=EdgeParams)
     regions: RegionParams = field(default_factory=RegionParams)
@@ -108,6 +121,7 @@ class Params:
         sections: dict[str, Any] = {
             "cleaning": CleaningParams,
             "normals": NormalParams,
+            "registration": RegistrationParams,
             "grid": GridParams,
             "edges": EdgeParams,
             "regions": RegionParams,

@@ -20,8 +20,9 @@ from octoseg_ti.stages.measure import stripe_noise, stripe_spacing
 from octoseg_ti.stages.moments import LEVEL, STOP
 from octoseg_ti.stages.neighbors import neighbor_normals
 from octoseg_ti.stages.normals import edge_pair_normals
+from octoseg_ti.stages.refinement import refine_poses
 from octoseg_ti.stages.registration import to_world
-from octoseg_ti.types import Measurement, Scans, Segmentation
+from octoseg_ti.types import Measurement, Registration, Scans, Segmentation
 
 STAGES = ("cleaning", "normals", "registration", "measure", "grid", "edges", "regions", "patches")
 """The stages, in order."""
@@ -79,7 +80,7 @@ def segment(
     with stage("normals"):
         normal, measured = estimate_normals(scans, arranged, measured, params)
     with stage("registration"):
-        point, normal = register(scans, arranged, normal)
+        point, normal, aligned = register(scans, arranged, normal, measured, params)
     with stage("measure"):
         measured = measure_noise(arranged, point, normal, measured, params)
         params = derive(params, measured)
@@ -94,6 +95,8 @@ def segment(
         result = assemble(
             scans, arranged, point, normal, grid, leaves, edge, cell_label, label, measured, params
         )
+    if aligned is not None:
+        result = with_registration(result, scans, aligned)
     return replace(result, seconds=trace.seconds)
 
 
@@ -160,11 +163,42 @@ def estimate_normals(
     return estimated, measured
 
 
-def register(scans: Scans, arranged: Arranged, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and normals in the world."""
+def register(
+    scans: Scans, arranged: Arranged, normal: np.ndarray, measured: Measurement, params: Params
+) -> tuple[np.ndarray, np.ndarray, Registration | None]:
+    """Return points and normals in the world, and how the views were aligned, where asked for."""
     if scans.frame == "world" or scans.T_world_view is None:
-        return arranged.points, normal
-    return to_world(arranged.points, normal, arranged.view, scans.T_world_view)
+        point = arranged.points
+    else:
+        point, normal = to_world(arranged.points, normal, arranged.view, scans.T_world_view)
+    if not params.registration.refine:
+        return point, normal, None
+    chosen = derive(params, measured).registration
+    assert chosen.reach is not None
+    aligned = refine_poses(
+        point,
+        normal,
+        arranged.view,
+        scans.T_world_view,
+        reach=chosen.reach,
+        overlap=chosen.overlap,
+    )
+    # What was moved goes from its recorded to its refined place; the rest keeps every bit.
+    moved = (aligned.refined != aligned.recorded).any(axis=(1, 2))
+    if moved.any():
+        change = aligned.change()
+        point, normal = to_world(point, normal, arranged.view, change)
+    return point, normal, aligned
+
+
+def with_registration(result: Segmentation, scans: Scans, aligned: Registration) -> Segmentation:
+    """Return the result with its registration; points left out move with their views too."""
+    out = np.flatnonzero(result.outlier)
+    if len(out) and scans.view is not None:
+        change = aligned.change()[scans.view[out]]
+        points = result.points
+        points[out] = np.einsum("nij,nj->ni", change[:, :3, :3], points[out]) + change[:, :3, 3]
+    return replace(result, registration=aligned)
 
 
 def measure_noise(

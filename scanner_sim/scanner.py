@@ -25,6 +25,8 @@ class View:
     """Direction of the tilt around the vertical, from the x axis [rad]."""
     turn: float = 0.0
     """Turn of the probe about its own axis [rad]; at 0 the camera sits above the laser."""
+    offset: float = 0.0
+    """Shift of the whole pass along the laser line [mm]; 0 = over the middle of the part."""
 
     def rotation(self) -> np.ndarray:
         """Return the rotation from the view to the world, shape (3, 3)."""
@@ -83,6 +85,11 @@ class StripeScanner:
     wide as the part."""
     depth_of_field: float | None = None
     """Depth around the plane z = 0 within which points are measured [mm]; None = all."""
+    pose_noise: float = 0.0
+    """Standard deviation of the error of a recorded pose along each axis [mm]; the first view is
+    the datum and has none."""
+    pose_angle_noise: float = 0.0
+    """Standard deviation of the error of a recorded pose about each axis [rad]; as above."""
     stripe_rate: float = 60.0
     """Stripes a second."""
     views: tuple[View, ...] | None = None
@@ -99,7 +106,7 @@ class StripeScanner:
         for name in ("stripe_pitch", "point_pitch", "points", "field_of_view", "depth_of_field"):
             value = getattr(self, name)
             self._check(name, value is None or value > 0, "above 0")
-        for name in ("range_noise", "lost_ends"):
+        for name in ("range_noise", "lost_ends", "pose_noise", "pose_angle_noise"):
             self._check(name, getattr(self, name) >= 0.0, "0 or more")
         for name in ("dropout", "lost_stripes"):
             self._check(name, 0.0 <= getattr(self, name) < 1.0, "at least 0 and below 1")

@@ -1,20 +1,24 @@
-"""`simulate`: a part and a scanner give scans, and the truth about every point."""
+"""`simulate`: a part and a scanner give scans, and the truth about every point.
+
+`scan_views` gives the same scans pass by pass, for consumers that cannot wait or hold them all.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from octoseg_ti.errors import DataError
 from octoseg_ti.types import Scans, Truth
+from scanner_sim.poses import as_recorded, recorded_poses
 from scanner_sim.scanner import DEFAULT_VIEWS, StripeScanner, View
 from scanner_sim.target import as_target, far_enough
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable, Iterator
 
     from scanner_sim.part import Part
     from scanner_sim.target import Target
@@ -40,6 +44,23 @@ class _Pass(NamedTuple):
     """Direction of the laser's ray, world, unit."""
 
 
+class _Arrived(NamedTuple):
+    """A pass, which of its points arrive, and the random numbers of its view from here on."""
+
+    scan: _Pass
+    keep: np.ndarray
+    generator: np.random.Generator
+
+
+class _View(NamedTuple):
+    """The scans of a view, and what is true about their points; world coordinates."""
+
+    scans: Scans
+    position: np.ndarray
+    normal: np.ndarray
+    surface: np.ndarray
+
+
 def simulate(
     part: Part | Target,
     scanner: StripeScanner | None = None,
@@ -54,7 +75,7 @@ def simulate(
     number of threads.
 
     Args:
-        part: The solid, in mm: CSG, or read from a file by `read_part`.
+        part: The solid, in mm.
         scanner: The scanner; None takes `StripeScanner` with its defaults.
         seed: Seed of noise and losses; every view draws from its own child of it.
         progress: Called with the name of the work and the share that is done, 0..1.
@@ -66,63 +87,160 @@ def simulate(
         DataError: The part is unbounded, the scanner sees nothing of it, or it cannot deliver as
             many points as asked for at the pitches that were given.
     """
+    stream = scan_views(part, scanner, seed=seed, progress=progress)
+    pieces = list(stream)
+    assert stream.truth is not None
+    return joined(pieces), stream.truth
+
+
+class ScanStream:
+    """The scans of a part, one view after the other; iterate over it once.
+
+    Every item is complete: the points of one view, with the numbers that they have in the whole
+    scan, and the poses of all views so far. Afterwards ``truth`` tells about all points.
+    """
+
+    truth: Truth | None = None
+    """The truth about the points of all items, one after the other; None before the end, and
+    where it was not asked for."""
+
+    def __init__(
+        self, views: Iterator[_View], finish: Callable[[list[_View]], Truth] | None, at_once: bool
+    ) -> None:
+        """Join what makes the views and what makes the truth of them."""
+        self._views, self._finish = views, finish
+        self.at_once = at_once
+        """Every view is given as soon as it is scanned; False = all are scanned first, because a
+        wanted number of points is reached by thinning the whole."""
+
+    def __iter__(self) -> Iterator[Scans]:
+        """Scan view after view."""
+        known: list[_View] = []
+        for view in self._views:
+            if self._finish is not None:
+                known.append(view._replace(scans=replace(view.scans, points=np.empty((0, 3)))))
+            yield view.scans
+        if self._finish is not None:
+            self.truth = self._finish(known)
+
+
+def scan_views(
+    part: Part | Target,
+    scanner: StripeScanner | None = None,
+    *,
+    seed: int = 0,
+    truth: bool = True,
+    progress: Callable[[str, float], None] | None = None,
+) -> ScanStream:
+    """Scan a part view by view: the same arrays as `simulate`, as they are made.
+
+        stream = scan_views(part, scanner, seed=7)
+        for scans in stream:
+            writer.add(scans)
+        stream.truth
+
+    With given pitches and no wanted number of points one view at a time is in memory, beside what
+    the truth needs (about 100 bytes a point). A wanted number takes all views first, because it is
+    reached by thinning the whole.
+
+    Args:
+        part: The solid, in mm.
+        scanner: The scanner; None takes `StripeScanner` with its defaults.
+        seed: Seed of noise and losses; every view draws from its own child of it.
+        truth: Keep what the truth about all points needs; without it memory stays bounded.
+        progress: Called with the name of the work and the share that is done, 0..1.
+
+    Returns:
+        A stream of `Scans`. Its errors are those of `simulate`, raised while it is read.
+    """
     scanner = scanner or StripeScanner()
     report = progress or (lambda name, done: None)
     target = as_target(part)
     far = far_enough(target, scanner.stand_off, StripeScanner().stand_off)
-    scanner = dataclasses.replace(scanner, stand_off=far)
-    views = scanner.views or part.views or DEFAULT_VIEWS
-    wanted = scanner.points or part.nominal_points
+    scanner = replace(scanner, stand_off=far)
+    views = scanner.views or target.views or DEFAULT_VIEWS
+    wanted = scanner.points or target.nominal_points
     free = scanner.stripe_pitch is None and scanner.point_pitch is None
-    report("scan", 0.0)
-    across, along = _pitches(target, scanner, views, wanted if free else scanner.points)
-    for _ in range(_ATTEMPTS):
-        passes = []
-        for v, view in enumerate(views):
-            passes.append(_scan(target, scanner, view, across, along))
-            report("scan", (v + 1) / len(views))
-        root = np.random.SeedSequence(seed)
-        generators = [np.random.default_rng(s) for s in root.spawn(len(views) + 1)]
-        keep = [_losses(p, scanner, g) for p, g in zip(passes, generators, strict=False)]
-        count = int(sum(k.sum() for k in keep))
-        if not (free and wanted) or wanted <= count <= 1.05 * wanted or count == 0:
-            break
-        scale = math.sqrt(count / (wanted * _SURPLUS))
-        across, along = across * scale, along * scale
-    if count == 0:
-        raise DataError(
-            f"the scanner sees nothing of part {part.name or 'without a name'!r}",
-            hint="look at views, field_of_view, depth_of_field and the limits of the angles",
-        )
     exact = wanted if free else scanner.points
+    report("scan", 0.0)
+    across, along = _pitches(target, scanner, views, exact)
+
+    def passes(across: float, along: float) -> Iterator[_Arrived]:
+        for v, seq in zip(range(len(views)), _children(seed, len(views)), strict=False):
+            scan = _scan(target, scanner, views[v], across, along)
+            generator = np.random.default_rng(seq)
+            report("scan", (v + 1) / len(views))
+            yield _Arrived(scan, _losses(scan, scanner, generator), generator)
+
+    arrived: Iterable[_Arrived] = passes(across, along)
     if exact is not None:
-        _thin(keep, exact, generators[-1])
-    scans = _assemble(passes, keep, scanner, views, target, generators)
-    report("truth", 0.0)
-    assert scans.stripe is not None and scans.column is not None
-    truth = target.truth(
-        position=np.concatenate([p.position[k] for p, k in zip(passes, keep, strict=True)]),
-        normal=np.concatenate([p.normal[k] for p, k in zip(passes, keep, strict=True)]),
-        surface=np.concatenate([p.surface[k] for p, k in zip(passes, keep, strict=True)]),
-        stripe=scans.stripe,
-        column=scans.column,
-        reach=2.0 * max(across, along) / max(math.cos(scanner.incidence_limit), 0.3),
-        info={
-            "part": part.name,
-            "seed": str(seed),
-            "range_noise_mm": repr(scanner.range_noise),
-            "stripe_pitch_mm": repr(across),
-            "point_pitch_mm": repr(along),
-        },
-    )
-    report("truth", 1.0)
-    return scans, truth
+        for _ in range(_ATTEMPTS):
+            arrived = list(arrived)
+            count = int(sum(one.keep.sum() for one in arrived))
+            if not free or exact <= count <= 1.05 * exact or count == 0:
+                break
+            scale = math.sqrt(count / (exact * _SURPLUS))
+            across, along = across * scale, along * scale
+            arrived = passes(across, along)
+        arrived = list(arrived)
+        thinning = np.random.default_rng(_children(seed, len(views))[-1])
+        if any(one.keep.any() for one in arrived):
+            _thin([one.keep for one in arrived], exact, thinning)
+
+    def finish(known: list[_View]) -> Truth:
+        report("truth", 0.0)
+        answer = target.truth(
+            position=np.concatenate([one.position for one in known]),
+            normal=np.concatenate([one.normal for one in known]),
+            surface=np.concatenate([one.surface for one in known]),
+            stripe=np.concatenate([_given(one.scans.stripe) for one in known]),
+            column=np.concatenate([_given(one.scans.column) for one in known]),
+            reach=2.0 * max(across, along) / max(math.cos(scanner.incidence_limit), 0.3),
+            info={
+                "part": target.name,
+                "seed": str(seed),
+                "range_noise_mm": repr(scanner.range_noise),
+                "stripe_pitch_mm": repr(across),
+                "point_pitch_mm": repr(along),
+            },
+        )
+        report("truth", 1.0)
+        return replace(answer, T_world_view=_true_poses(target, views))
+
+    pieces = _assemble(arrived, scanner, views, target, seed)
+    return ScanStream(pieces, finish if truth else None, at_once=exact is None)
+
+
+def joined(pieces: list[Scans]) -> Scans:
+    """Return the scans of all views of a stream as one."""
+    names = ("points", "stripe", "column", "view", "time_ns")
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(one, name) for one in pieces]) for name in names
+    }
+    return replace(pieces[-1], **arrays)
+
+
+def _given(array: np.ndarray | None) -> np.ndarray:
+    assert array is not None
+    return array
+
+
+def _children(seed: int, views: int) -> list[np.random.SeedSequence]:
+    """Return the seeds of the views, and one for what concerns the whole."""
+    return np.random.SeedSequence(seed).spawn(views + 1)
+
+
+def _true_poses(target: Target, views: tuple[View, ...]) -> np.ndarray:
+    """Return the true pose of every view: its frame lies in the middle of the part."""
+    poses = np.tile(np.eye(4), (len(views), 1, 1))
+    poses[:, :3, :3] = [view.rotation() for view in views]
+    poses[:, :3, 3] = target.box.mean(axis=0)
+    return poses
 
 
 def _pitches(
-    target: Target, scanner: StripeScanner, views: tuple[View, ...],
-    wanted: int | None,
-) -> tuple[float, float]:  # fmt: skip
+    target: Target, scanner: StripeScanner, views: tuple[View, ...], wanted: int | None
+) -> tuple[float, float]:
     """Return stripe and point pitch [mm]; what is open follows from the number of points wanted."""
     across, along = scanner.stripe_pitch, scanner.point_pitch
     if across is None and along is not None:
@@ -152,13 +270,13 @@ def _extent(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return lowest and highest stage and ray position that meet the part's box, shape (3,) each.
 
-    x = stage, y = where the ray meets the plane z = 0, z = height; all in the frame of the view
-    [mm].
+    x = stage, y = where the ray meets the plane z = 0, seen from the laser, z = height; all in the
+    frame of the view [mm].
     """
     middle = limits.mean(axis=0)
     corners = np.array([[limits[i, 0], limits[j, 1], limits[k, 2]]
                         for i in (0, 1) for j in (0, 1) for k in (0, 1)])  # fmt: skip
-    local = (corners - middle) @ view.rotation()
+    local = (corners - middle) @ view.rotation() - (0.0, view.offset, 0.0)
     if local[:, 2].max() >= scanner.stand_off:
         raise DataError(
             f"the part reaches the probe: its box ends {local[:, 2].max():.0f} mm above its "
@@ -187,7 +305,9 @@ def _scan(
     x = _spread(low[0], high[0], across)
     y = _spread(low[1], high[1], along)
     stripes, columns = len(x), len(y)
-    source = np.stack([x, np.zeros(stripes), np.full(stripes, scanner.stand_off)], axis=1)
+    source = np.stack(
+        [x, np.full(stripes, view.offset), np.full(stripes, scanner.stand_off)], axis=1
+    )
     ray = np.stack([np.zeros(columns), y, np.full(columns, -scanner.stand_off)], axis=1)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     source_world = source @ rotation.T + middle
@@ -258,36 +378,42 @@ def _thin(keep: list[np.ndarray], wanted: int, generator: np.random.Generator) -
 
 
 def _assemble(
-    passes: list[_Pass], keep: list[np.ndarray], scanner: StripeScanner, views: tuple[View, ...],
-    target: Target, generators: list[np.random.Generator],
-) -> Scans:  # fmt: skip
-    """Return the scans: noise along the line of sight, points in the frames of their views."""
-    middle = target.box.mean(axis=0)
-    poses = np.tile(np.eye(4), (len(views), 1, 1))
-    points, stripe, times = [], [], []
-    first = 0
-    for v, (scan, chosen) in enumerate(zip(passes, keep, strict=True)):
-        poses[v, :3, :3] = views[v].rotation()
-        poses[v, :3, 3] = middle
-        noise = generators[v].normal(0.0, scanner.range_noise, int(chosen.sum()))
-        world = scan.position[chosen] + noise[:, None] * scan.sight[chosen]
-        points.append((world - middle) @ poses[v, :3, :3])
-        stripe.append(scan.stripe[chosen] + first)
+    arrived: Iterable[_Arrived], scanner: StripeScanner, views: tuple[View, ...], target: Target,
+    seed: int,
+) -> Iterator[_View]:  # fmt: skip
+    """Give the scans of view after view: noise along the line of sight, frames of the views."""
+    true = _true_poses(target, views)
+    recorded = recorded_poses(true, scanner, seed)
+    origin, stripe_origin = np.empty((0, 3)), np.empty((0, 3))
+    period = 1e9 / scanner.stripe_rate
+    first = count = 0
+    for v, (scan, chosen, generator) in enumerate(arrived):
+        noise = generator.normal(0.0, scanner.range_noise, int(chosen.sum()))
+        position = scan.position[chosen]
+        world = position + noise[:, None] * scan.sight[chosen]
+        stripe = scan.stripe[chosen] + first
         columns = int(scan.column.max(initial=0)) + 1
-        period = 1e9 / scanner.stripe_rate
         # The camera reads its rows one after the other within the period of a stripe.
-        moment = (stripe[-1] + scan.column[chosen] / columns) * period
-        times.append(moment.astype(np.int64))
-        first += len(scan.source)
-    return Scans(
-        points=np.concatenate(points),
-        stripe=np.concatenate(stripe).astype(np.int32),
-        column=np.concatenate([p.column[k] for p, k in zip(passes, keep, strict=True)]),
-        view=np.repeat(np.arange(len(views), dtype=np.int32), [int(k.sum()) for k in keep]),
-        time_ns=np.concatenate(times),
-        T_world_view=poses,
-        origin=np.stack([p.source.mean(axis=0) for p in passes]),
-        stripe_origin=np.concatenate([p.source for p in passes]),
-        frame="view",
-        name=target.name,
-    )
+        moment = (stripe + scan.column[chosen] / columns) * period
+        place = as_recorded(scan.source, true[v], recorded[v])
+        origin = np.concatenate([origin, place.mean(axis=0, keepdims=True)])
+        stripe_origin = np.concatenate([stripe_origin, place])
+        first, count = first + len(scan.source), count + len(world)
+        scans = Scans(
+            points=(world - true[v, :3, 3]) @ true[v, :3, :3],
+            stripe=stripe.astype(np.int32),
+            column=scan.column[chosen],
+            view=np.full(len(world), v, np.int32),
+            time_ns=moment.astype(np.int64),
+            T_world_view=recorded[: v + 1],
+            origin=origin,
+            stripe_origin=stripe_origin,
+            frame="view",
+            name=target.name,
+        )
+        yield _View(scans, position, scan.normal[chosen], scan.surface[chosen])
+    if count == 0:
+        raise DataError(
+            f"the scanner sees nothing of part {target.name or 'without a name'!r}",
+            hint="look at views, field_of_view, depth_of_field and the limits of the angles",
+        )

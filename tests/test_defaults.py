@@ -12,6 +12,7 @@ from octoseg_ti.params import (
     NormalParams,
     Params,
     RegionParams,
+    RegistrationParams,
 )
 from octoseg_ti.types import Measurement
 
@@ -61,6 +62,7 @@ def test_given_values_stay() -> None:
     given = Params(
         cleaning=CleaningParams(spike=0.7, isolation=8.0),
         normals=NormalParams(gap=0.9),
+        registration=RegistrationParams(reach=2.5),
         grid=GridParams(tolerance=0.2, edge_tolerance=0.25, min_cell=3.0, divisions=7),
         regions=RegionParams(homogeneity=0.5, min_points=11),
     )

@@ -8,7 +8,8 @@ import pytest
 
 HEAVY = [
     "PIL", "foxglove_schemas_protobuf", "google.protobuf", "laspy", "mcap", "mcap_protobuf",
-    "plyfile", "pye57", "pyarrow", "rerun", "rich", "scipy", "taichi", "tyro",
+    "plyfile", "pye57", "pyarrow", "rerun", "rich", "scipy", "small_gicp",
+    "taichi", "tyro",
 ]  # fmt: skip
 
 

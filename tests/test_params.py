@@ -21,7 +21,10 @@ def test_missing_sections_and_keys_keep_their_defaults() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"grids": {}}, "unknown parameter section 'grids'; known: cleaning, normals, grid"),
+        (
+            {"grids": {}},
+            "unknown parameter section 'grids'; known: cleaning, normals, registration, grid",
+        ),
         ({"grid": {"tolerence": 1}}, "unknown parameter grid.tolerence; known: .*tolerance"),
     ],
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -15,7 +15,7 @@ from octoseg_ti.cli.output import out, out_json, progress, size_of
 from octoseg_ti.params import PRESETS, Params
 
 if TYPE_CHECKING:
-    from octoseg_ti.types import Segmentation
+    from octoseg_ti.types import Registration, Segmentation, Truth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +36,9 @@ class SegmentOptions:
     """File to write, by suffix: .mcap .npz .ply .pcd .xyz .rrd"""
     preset: Literal["default", "paper"] = "default"
     """"default" measures what it needs; "paper" is the published method with user values."""
+    refine: bool = False
+    """Align overlapping views to each other by ICP before segmenting; the recorded poses are the
+    start. Short for --params.registration.refine."""
     topic: str | None = None
     """Topic of the points, when a recording has several."""
     unit: Literal["mm", "m"] | None = None
@@ -83,8 +86,11 @@ def run_segment(options: SegmentOptions) -> int:
 
     from octoseg_ti.pipeline import segment
 
+    params = options.params
+    if options.refine:
+        params = replace(params, registration=replace(params.registration, refine=True))
     with progress("segment", quiet=options.quiet) as report:
-        result = segment(scans, params=options.params, progress=report)
+        result = segment(scans, params=params, progress=report)
         for path in options.output:
             report(f"write {path.name}")
             files.write(path, result, truth=truth, scans=scans, run={"command": "octoseg segment"})
@@ -93,9 +99,17 @@ def run_segment(options: SegmentOptions) -> int:
         return 0
     if options.json:
         outputs = {"outputs": options.output, "total_seconds": whole}
-        out_json({"input": options.input, **summary(result), **outputs})
+        figures = {**summary(result), "pose_errors": pose_figures(result, truth)}
+        out_json({"input": options.input, **figures, **outputs})
     else:
         out(str(result))
+        errors = pose_figures(result, truth)
+        if errors is not None:
+            out(
+                f"  relative poses against the truth, at most: recorded "
+                f"{errors['recorded_mm']:.4f} mm {errors['recorded_deg']:.4f} deg, refined "
+                f"{errors['refined_mm']:.4f} mm {errors['refined_deg']:.4f} deg"
+            )
         for path in options.output:
             out(f"wrote {path} ({size_of(path)})")
     return 0
@@ -127,7 +141,54 @@ def summary(result: Segmentation) -> dict[str, Any]:
             }
             for k in range(result.patch_count)
         ],
+        "registration": registration_figures(result.registration),
         "measured": asdict(result.measured),
         "params": result.params.to_dict(),
         "seconds": result.seconds,
+    }
+
+
+def pose_figures(result: Segmentation, truth: Truth | None) -> dict[str, Any] | None:
+    """Return how far relative poses are from the true ones; None where either is not known."""
+    if result.registration is None or truth is None or truth.T_world_view is None:
+        return None
+    from octoseg_ti.evaluation import pose_errors
+
+    figures = {}
+    for name in ("recorded", "refined"):
+        shift, angle = pose_errors(getattr(result.registration, name), truth.T_world_view)
+        figures[f"{name}_mm"], figures[f"{name}_deg"] = shift, float(np.degrees(angle))
+    return figures
+
+
+def registration_figures(aligned: Registration | None) -> dict[str, Any] | None:
+    """Return how the views were aligned, for JSON; None when they were not."""
+    if aligned is None:
+        return None
+    shift, angle = aligned.moves()
+    return {
+        "rms_before_mm": aligned.rms_before,
+        "rms_after_mm": aligned.rms_after,
+        "datum": aligned.datum,
+        "left_as_recorded": aligned.left,
+        "pairs": [
+            {
+                "views": pair,
+                "matches": int(aligned.matches[k]),
+                "rms_before_mm": float(aligned.before[k]),
+                "rms_after_mm": float(aligned.after[k]),
+            }
+            for k, pair in enumerate(aligned.pairs.tolist())
+        ],
+        "views": [
+            {
+                "view": v,
+                "moved_mm": float(shift[v]),
+                "turned_deg": float(np.degrees(angle[v])),
+                "open_directions": int(aligned.open[v]),
+                "recorded": aligned.recorded[v],
+                "refined": aligned.refined[v],
+            }
+            for v in range(len(shift))
+        ],
     }

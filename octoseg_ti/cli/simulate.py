@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,13 +10,15 @@ import tyro
 
 from octoseg_ti.cli import UsageError, suggest
 from octoseg_ti.cli.options import Machine, check_inputs, check_outputs
-from octoseg_ti.cli.output import out, out_json, progress, size_of
-from scanner_sim.scanner import StripeScanner
+from octoseg_ti.cli.output import Report, out, out_json, progress, size_of
+from octoseg_ti.errors import DataError
+from scanner_sim.scanner import StripeScanner, View
 from scanner_sim.solid_options import SUFFIXES as SOLIDS
 from scanner_sim.solid_options import SolidOptions
 
 if TYPE_CHECKING:
     from octoseg_ti.types import Scans, Truth
+    from scanner_sim import ScanStream
 
 SUFFIXES = (".mcap", ".npz", ".ply", ".rrd")
 
@@ -41,6 +43,15 @@ class SimulateOptions:
     """File to write, by suffix: .mcap .npz .ply .rrd"""
     seed: int = 7
     """Seed of noise and dropouts."""
+    views: str | None = None
+    """Where to look from: "auto" plans indexed orientations of the probe head that cover the part,
+    a number takes at most so many of these, and "tilt,azimuth;tilt,azimuth" in degrees names them
+    (a third number shifts the pass along the laser line, in mm). Default: the views of the part."""
+    overlap: float = 0.3
+    """Share of a planned pass that its neighbours see too, 0..0.9."""
+    truth: bool = True
+    """Record the truth about every point. Without it, and with the pitches given, memory stays
+    bounded for any number of points."""
     json: bool = False
     """Print the figures as JSON."""
     quiet: bool = False
@@ -58,23 +69,85 @@ def run_simulate(options: SimulateOptions) -> int:
     check_outputs([options.output], SUFFIXES)
     part = find_part(options.part, options.solid)
     options.machine.start()
-    from octoseg_ti import files
-    from scanner_sim import simulate
+    scanner = options.scanner
+    if options.views is not None:
+        views = chosen_views(part, scanner, options.views, options.overlap)
+        scanner = replace(scanner, views=views)
+    run = {"command": "octoseg simulate", "part": options.part, "seed": str(options.seed)}
+    from scanner_sim import scan_views
 
     with progress("simulate", quiet=options.quiet) as report:
-        scans, truth = simulate(part, options.scanner, seed=options.seed, progress=report)
-        report(f"write {options.output.name}")
-        run = {"command": "octoseg simulate", "part": options.part, "seed": str(options.seed)}
-        files.write(options.output, scans, truth=truth, run=run)
+        stream = scan_views(part, scanner, seed=options.seed, truth=options.truth, progress=report)
+        # With all views scanned before the first is given there is nothing to gain from parts, and
+        # truth beside its stripe packs better.
+        in_parts = stream.at_once and options.output.suffix.lower() == ".mcap"
+        figures = (_write_parts if in_parts else _write_whole)(options, stream, run, report)
     if options.json:
-        figures = scan_summary(scans, truth)
         out_json({"part": options.part, "seed": options.seed, **figures, "output": options.output})
     elif not options.quiet:
         if hasattr(part, "summary"):
             out(part.summary())
-        out(describe_scan(options.part, scans, truth))
+        out(_line(options.part, figures))
         out(f"wrote {options.output} ({size_of(options.output)})")
     return 0
+
+
+def _write_parts(
+    options: SimulateOptions, stream: ScanStream, run: dict[str, str], report: Report
+) -> dict[str, Any]:
+    """Write a recording view by view, as the scan goes on; the truth follows at the end."""
+    from octoseg_ti.files.recording_write import RecordingWriter
+
+    figures = {"points": 0, "stripes": 0, "views": 0}
+    with RecordingWriter(
+        options.output, name=run["part"], run=run, truth_follows=options.truth
+    ) as writer:
+        for scans in stream:
+            writer.add(scans)
+            if len(scans):
+                figures = {name: n + _counts(scans)[name] for name, n in figures.items()}
+        if stream.truth is not None:
+            report(f"write the truth to {options.output.name}")
+            writer.add_truth(stream.truth)
+    return figures | _truth_figures(stream.truth)
+
+
+def _write_whole(
+    options: SimulateOptions, stream: ScanStream, run: dict[str, str], report: Report
+) -> dict[str, Any]:
+    """Write everything in one piece."""
+    from octoseg_ti import files
+    from scanner_sim.simulate import joined
+
+    scans = joined(list(stream))
+    report(f"write {options.output.name}")
+    files.write(options.output, scans, truth=stream.truth, run=run)
+    return _counts(scans) | _truth_figures(stream.truth)
+
+
+def _truth_figures(truth: Truth | None) -> dict[str, Any]:
+    if truth is None:
+        return {"patches": None, "truth": None}
+    return {"patches": truth.patch_count, "truth": truth.info}
+
+
+def chosen_views(part: Any, scanner: StripeScanner, text: str, overlap: float) -> tuple[View, ...]:
+    """Return the views that ``--views`` asks for.
+
+    Raises:
+        UsageError: The text is neither "auto", nor a number, nor a list of views.
+    """
+    from scanner_sim import parse_views, plan_views
+
+    word = text.strip().lower()
+    try:
+        if word == "auto" or word.isdigit():
+            count = None if word == "auto" else int(word)
+            return plan_views(part, scanner, overlap=overlap, count=count)
+        return parse_views(text)
+    except DataError as error:
+        hint = "" if error.hint else '; write "auto", a number, or "tilt,azimuth;..." in degrees'
+        raise UsageError(f"simulate: --views {text}: {error}{hint}") from error
 
 
 def find_part(name: str, solid: SolidOptions | None = None) -> Any:
@@ -88,7 +161,6 @@ def find_part(name: str, solid: SolidOptions | None = None) -> Any:
         UsageError: There is no part of this name.
         DataError: The file cannot be read.
     """
-    from octoseg_ti.errors import DataError
     from scanner_sim import blocks
 
     if name.partition(":")[0] == "random":
@@ -111,21 +183,28 @@ def find_part(name: str, solid: SolidOptions | None = None) -> Any:
 
 def scan_summary(scans: Scans, truth: Truth) -> dict[str, Any]:
     """Return the figures of a simulated scan."""
+    return _counts(scans) | _truth_figures(truth)
+
+
+def _counts(scans: Scans) -> dict[str, Any]:
     import numpy as np
 
     return {
         "points": len(scans),
         "stripes": 0 if scans.stripe is None else len(np.unique(scans.stripe)),
         "views": 1 if scans.view is None else len(np.unique(scans.view)),
-        "patches": truth.patch_count,
-        "truth": truth.info,
     }
 
 
 def describe_scan(part: str, scans: Scans, truth: Truth) -> str:
     """Return the same in a line."""
-    s = scan_summary(scans, truth)
+    return _line(part, scan_summary(scans, truth))
+
+
+def _line(part: str, figures: dict[str, Any]) -> str:
+    patches = figures["patches"]
+    known = "no truth recorded" if patches is None else f"{patches} true patches"
     return (
-        f"{part}: {s['points']} points in {s['stripes']} stripes and {s['views']} view(s), "
-        f"{s['patches']} true patches"
+        f"{part}: {figures['points']} points in {figures['stripes']} stripes and "
+        f"{figures['views']} view(s), {known}"
     )

@@ -24,6 +24,7 @@ from octoseg_ti.evaluation.points import (
     score_edges,
     score_normals,
 )
+from octoseg_ti.evaluation.poses import pose_errors
 from octoseg_ti.evaluation.scores import EdgeScores, NormalScores, RegionScores, Scores
 from octoseg_ti.types import EdgeClass, Truth
 
@@ -35,6 +36,7 @@ __all__ = [
     "RegionScores",
     "Scores",
     "evaluate",
+    "pose_errors",
     "wrong_points",
 ]
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from octoseg_ti.params import Params
-from octoseg_ti.types import Cells, Measurement, Scans, Segmentation, Truth
+from octoseg_ti.types import Cells, Measurement, Registration, Scans, Segmentation, Truth
 
 _SAMPLE = 2048
 _NOISE = 0.95  # deflate would save less than this leaves
@@ -83,7 +83,8 @@ def _reference_bits(reference: np.ndarray) -> np.ndarray:
 def pack_truth(truth: Truth, points: np.ndarray) -> bytes:
     """Return ``ground_truth.npz``: every array of the truth in point order, without loss.
 
-    ``patch``, ``surface``, ``kind``, ``edge_distance``, ``edge_class`` are stored as they are;
+    ``patch``, ``surface``, ``kind``, ``edge_distance``, ``edge_class`` and ``T_world_view`` are
+    stored as they are;
     ``position_byte0`` to 7 and ``normal_byte0`` to 7, each (N, 3) u8, hold the bytes of the f64
     rows, lowest first, the positions XOR those of ``points``. This halves the file.
 
@@ -92,7 +93,7 @@ def pack_truth(truth: Truth, points: np.ndarray) -> bytes:
         points: Positions as a reader of the recording sees them [mm], world frame, shape (N, 3).
     """
     arrays: dict[str, Any] = {"patch": truth.patch, "info": json.dumps(truth.info)}
-    for name in ("surface", "kind", "edge_distance", "edge_class"):
+    for name in ("surface", "kind", "edge_distance", "edge_class", "T_world_view"):
         if getattr(truth, name) is not None:
             arrays[name] = getattr(truth, name)
     if truth.position is not None:
@@ -139,6 +140,9 @@ def result_arrays(result: Segmentation, *, per_point: bool) -> dict[str, Any]:
     arrays["measured"] = np.array(
         [getattr(result.measured, name) for name in _MEASURED_FIELDS], np.float64
     )
+    if result.registration is not None:
+        for name in _REGISTRATION_FIELDS:
+            arrays[f"registration_{name}"] = getattr(result.registration, name)
     arrays["passes"] = np.int64(result.passes)
     arrays["stage_names"] = np.array(list(result.seconds), dtype=np.str_)
     arrays["stage_seconds"] = np.array(list(result.seconds.values()), np.float64)
@@ -147,6 +151,11 @@ def result_arrays(result: Segmentation, *, per_point: bool) -> dict[str, Any]:
 
 
 _CELL_FIELDS = ("corner", "size", "level", "count", "normal", "sigma", "stop", "edge", "label")
+_REGISTRATION_FIELDS = {
+    "recorded": np.float64, "refined": np.float64, "datum": np.int32, "left": np.int32,
+    "open": np.int32, "pairs": np.int32, "matches": np.int32, "before": np.float64,
+    "after": np.float64,
+}  # fmt: skip
 _MEASURED_FIELDS = ("spacing_along", "spacing_across", "noise", "normal_noise")
 
 
@@ -187,6 +196,22 @@ def result_from_arrays(arrays: Mapping[str, Any]) -> Segmentation:
     cells = {name: np.asarray(arrays[f"cell_{name}"]) for name in _CELL_FIELDS}
     if len({len(value) for value in cells.values()}) != 1:
         raise ValueError("the arrays of the cells differ in length")
+    aligned = None
+    if "registration_refined" in arrays:
+        stored = {
+            name: np.ascontiguousarray(arrays[f"registration_{name}"], dtype)
+            for name, dtype in _REGISTRATION_FIELDS.items()
+        }
+        shape, pairs = stored["recorded"].shape, len(stored["pairs"])
+        if (
+            shape[1:] != (4, 4)
+            or stored["refined"].shape != shape
+            or len(stored["open"]) != len(stored["recorded"])
+        ):
+            raise ValueError("the poses of the registration do not belong together")
+        if any(len(stored[name]) != pairs for name in ("matches", "before", "after")):
+            raise ValueError(f"the registration differs in length from its {pairs} pairs")
+        aligned = Registration(**stored)
     names = [str(name) for name in np.asarray(arrays["stage_names"])]
     seconds = np.asarray(arrays["stage_seconds"], np.float64).tolist()
     measured = np.asarray(arrays["measured"], np.float64).tolist()
@@ -195,6 +220,7 @@ def result_from_arrays(arrays: Mapping[str, Any]) -> Segmentation:
         cells=Cells(initial_size=float(arrays["initial_size"]), **cells),
         params=Params.from_dict(json.loads(str(arrays["params"]))),
         measured=Measurement(**dict(zip(_MEASURED_FIELDS, measured, strict=True))),
+        registration=aligned,
         passes=int(arrays["passes"]),
         seconds=dict(zip(names, seconds, strict=True)),
         name=str(arrays["name"]),

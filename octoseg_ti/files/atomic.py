@@ -61,6 +61,17 @@ class AtomicFile:
         """Return the position in the part, as a stream does."""
         return self.file.tell()
 
+    def flush(self) -> None:
+        """Hand the bytes to the system, as a stream does.
+
+        Raises:
+            DataError: The disk is full or gone.
+        """
+        try:
+            self.file.flush()
+        except OSError as error:
+            raise cannot_write(self.path, error) from error
+
     def commit(self) -> None:
         """Close the part and give it its name.
 

@@ -178,7 +178,7 @@ def _recording_problems(path: Path) -> list[str]:
     contents = collect(path, None)
     factory = DecoderFactory()
     decoders: dict[int, Any] = {}
-    latest = -1
+    latest = {False: -1, True: -1}
     back = 0
     sequence: dict[int, int] = {}
     unordered: dict[str, int] = {}
@@ -207,8 +207,10 @@ def _recording_problems(path: Path) -> list[str]:
                 decoder(message.data)
             except DecodeError:
                 undecodable[channel.topic] = undecodable.get(channel.topic, 0) + 1
-        back += message.log_time < latest
-        latest = max(latest, message.log_time)
+        # Truth may follow its scan, and then starts again at time 0.
+        of_truth = channel.topic == "/truth/lines"
+        back += message.log_time < latest[of_truth]
+        latest[of_truth] = max(latest[of_truth], message.log_time)
         if channel.topic in ("/scan/lines", "/truth/lines"):
             if not seen_transform:
                 problems.append(f"no transform comes before the first cloud of {channel.topic}")

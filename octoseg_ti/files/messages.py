@@ -59,6 +59,9 @@ PARAMS_FIELDS = (
     ("regions_min_points", "double"),
     ("regions_assign_edges", "bool"),
     ("grid_edge_tolerance", "double"),
+    ("registration_refine", "bool"),
+    ("registration_reach", "double"),
+    ("registration_overlap", "double"),
 )
 """octoseg.Params: "section_option" of `Params`, mm and rad; NaN = derived from the data."""
 

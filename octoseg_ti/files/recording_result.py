@@ -67,6 +67,7 @@ def add_result(
     _add_views(writer, result, segments, time)
     _add_cells(writer, result.cells, time)
     _add_figures(writer, result, time)
+    _add_registration(writer, result, time)
     writer.attach(
         "result.npz",
         "application/zip",
@@ -214,6 +215,29 @@ def _add_figures(writer: RecordingWriter, result: Segmentation, time: int) -> No
         start += duration
     text = f"{len(result)} points in {len(result.cells)} cells: {result.patch_count} patches"
     _log(writer, text, time, messages.Log.INFO)
+
+
+def _add_registration(writer: RecordingWriter, result: Segmentation, time: int) -> None:
+    """Write the refined poses beside the recorded ones, and how well they fit."""
+    aligned = result.registration
+    if aligned is None:
+        return
+    entries = [("world", f"view_{v}/refined", pose) for v, pose in enumerate(aligned.refined)]
+    writer.register("/tf", messages.FrameTransforms, {"units": "m"})
+    message = messages.transform_message(entries, writer.start_ns + time)
+    writer.write("/tf", message.SerializeToString(), time)
+    writer.metadata(
+        "octoseg.registration",
+        {
+            "pairs": json.dumps(aligned.pairs.tolist()),
+            "rms_before_mm": json.dumps(aligned.before.tolist()),
+            "rms_after_mm": json.dumps(aligned.after.tolist()),
+            "datum": json.dumps(aligned.datum.tolist()),
+            "left_as_recorded": json.dumps(aligned.left.tolist()),
+            "open_directions": json.dumps(aligned.open.tolist()),
+        },
+    )
+    _log(writer, str(aligned), time, messages.Log.INFO)
 
 
 def _log(writer: RecordingWriter, text: str, time: int, level: int) -> None:

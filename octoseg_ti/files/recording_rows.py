@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -126,16 +127,26 @@ def truth_rows(truth: Truth, scan: np.ndarray, points: np.ndarray) -> np.ndarray
     return rows
 
 
+_PER_POINT = ("patch", "surface", "kind", "position", "normal", "edge_distance", "edge_class")
+
+
+def part_of(truth: Truth, rows: slice) -> Truth:
+    """Return the truth of some points."""
+    values = {name: getattr(truth, name) for name in _PER_POINT}
+    picked: dict[str, Any] = {n: None if v is None else v[rows] for n, v in values.items()}
+    return replace(truth, **picked)
+
+
 def joined(pieces: list[Truth]) -> Truth:
     """Return the truth of all pieces, one after the other."""
     if len(pieces) == 1:
         return pieces[0]
     fields: dict[str, Any] = {}
-    for name in ("patch", "surface", "kind", "position", "normal", "edge_distance", "edge_class"):
+    for name in _PER_POINT:
         values = [getattr(piece, name) for piece in pieces]
         if all(value is not None for value in values):
             fields[name] = np.concatenate(values)
-    return Truth(info=pieces[0].info, **fields)
+    return Truth(info=pieces[0].info, T_world_view=pieces[0].T_world_view, **fields)
 
 
 def _truth_dtype(truth: Truth, position: str) -> np.dtype:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -25,6 +25,7 @@ from octoseg_ti.files.recording_rows import (
     in_world,
     joined,
     needs_double,
+    part_of,
     positions,
     scan_rows,
     truth_rows,
@@ -41,6 +42,22 @@ START_NS = 1_767_225_600_000_000_000
 
 _NOMINAL_STEP_NS = 1_000_000  # a stripe without a time gets its turn, one millisecond each
 _BLOCK = 50_000  # points of a message when there are no stripes
+
+
+_TRUTH_NOTES = {"error_100nm": "distance from the true surface along its normal, 0.1 um"}
+
+
+class _Told(NamedTuple):
+    """A piece that waits for its truth."""
+
+    rows: np.ndarray
+    """Positions as the messages hold them, fields x, y, z."""
+    bounds: np.ndarray
+    """First row of every message, and the number of rows at the end."""
+    numbers: list[int]
+    """Stripe of every message."""
+    times: list[int]
+    """Time of every message [ns]."""
 
 
 class RecordingWriter:
@@ -60,6 +77,7 @@ class RecordingWriter:
         run: Mapping[str, str] | None = None,
         start_ns: int = START_NS,
         overwrite: bool = True,
+        truth_follows: bool = False,
     ) -> None:
         """Open the part file and write the header.
 
@@ -70,6 +88,8 @@ class RecordingWriter:
             run: How the recording came about, for the metadata record ``octoseg.run``.
             start_ns: Time stamp of time 0 [ns since 1970].
             overwrite: False refuses a file that exists.
+            truth_follows: `add_truth` will be called after the last piece; where the messages
+                lie is kept for it, 12 to 24 bytes a point.
 
         Raises:
             DataError: The output cannot be written.
@@ -79,7 +99,9 @@ class RecordingWriter:
         self.time_ns = 0
         """Time of the latest stripe since the start of the recording [ns]."""
         self._precise = precise
+        self._truth_follows = truth_follows
         self._truth: list[Truth] = []
+        self._told: list[_Told] = []
         self._points: list[np.ndarray] = []
         self._times: list[np.ndarray] = []
         self._extras: dict[str, np.ndarray] = {}
@@ -194,9 +216,9 @@ class RecordingWriter:
             self._form = form
         elif self._form != form:
             raise ValueError("every piece of a recording must have the same arrays")
+        self._extras.update(archives.scan_extras(scans))
         if len(scans) == 0:
             return
-        self._extras.update(archives.scan_extras(scans))
         points, normals = in_world(scans)
         rows = scan_rows(scans, points, normals, truth, self._position_type(points))
         truth_part = None
@@ -217,8 +239,7 @@ class RecordingWriter:
         scan_layout = self._layout("/scan/lines", rows.dtype, self._scan_notes(scans))
         truth_layout = None
         if truth_part is not None:
-            notes = {"error_100nm": "distance from the true surface along its normal, 0.1 um"}
-            truth_layout = self._layout("/truth/lines", truth_part.dtype, notes)
+            truth_layout = self._layout("/truth/lines", truth_part.dtype, _TRUTH_NOTES)
         for a, b, number, view, time in zip(
             first.tolist(), bounds[1:].tolist(), numbers, views, times, strict=True
         ):
@@ -227,6 +248,8 @@ class RecordingWriter:
             self.write("/scan/lines", scan_layout.pack(rows[a:b], stamp), time, number)
             if truth_part is not None and truth_layout is not None:
                 self.write("/truth/lines", truth_layout.pack(truth_part[a:b], stamp), time, number)
+        if self._truth_follows:
+            self._told.append(_Told(rows[["x", "y", "z"]].copy(), bounds, numbers, times))
         self._stripes += len(first)
         self.time_ns = max(self.time_ns, times[-1])
 
@@ -236,6 +259,41 @@ class RecordingWriter:
             worker = ThreadPoolExecutor(max_workers=1)
             self._sealed = worker.submit(self._pack_truth)
             worker.shutdown(wait=False)
+
+    def add_truth(self, truth: Truth) -> None:
+        """Append the truth of all stripes that were added, for a writer with ``truth_follows``.
+
+        The messages lie behind the stripes in the file, and carry the times and numbers of theirs:
+        readers order by time.
+
+        Args:
+            truth: The truth of all points, in their order.
+
+        Raises:
+            DataError: The disk is full.
+            ValueError: The truth has another number of points, or was not announced.
+        """
+        count = sum(len(told.rows) for told in self._told)
+        if not self._truth_follows or count != len(truth):
+            raise ValueError(f"truth of {len(truth)} points for {count} that wait for it")
+        self._writer.flush()  # every chunk stays in the order of time
+        at = 0
+        for told in self._told:
+            some = slice(at, at + len(told.rows))
+            at = some.stop
+            piece = part_of(truth, some)
+            stored = positions(told.rows)
+            rows = truth_rows(piece, told.rows, stored)
+            layout = self._layout("/truth/lines", rows.dtype, _TRUTH_NOTES)
+            for a, b, number, time in zip(
+                told.bounds[:-1].tolist(), told.bounds[1:].tolist(), told.numbers, told.times,
+                strict=True,
+            ):  # fmt: skip
+                data = layout.pack(rows[a:b], self.start_ns + time)
+                self.write("/truth/lines", data, time, number)
+            self._points.append(stored)
+        self._truth = [truth]
+        self._told = []
 
     def register(self, topic: str, message_class: Any, notes: Mapping[str, str]) -> None:
         """Open a channel, with its schema, unless the topic is there."""

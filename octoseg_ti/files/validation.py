@@ -160,6 +160,7 @@ def make_truth(path: str | Path | None, values: dict[str, Any], count: int | Non
             what = f"edge_distance has shape {distance.shape}, not ({n},)"
             raise DataError(what, path=path, hint="give one distance per point")
         fields["edge_distance"] = np.ascontiguousarray(distance, np.float32)
+    fields["T_world_view"] = _poses(path, given.get("T_world_view"))
     info = given.get("info", {})
     fields["info"] = json.loads(info) if isinstance(info, str) else dict(info)
     return Truth(**fields)

@@ -22,7 +22,7 @@ import numpy as np
 
 from octoseg_ti.errors import DataError
 from octoseg_ti.evaluation import Scores
-from octoseg_ti.types import Segmentation, StopReason, SurfaceKind, Truth
+from octoseg_ti.types import Registration, Segmentation, StopReason, SurfaceKind, Truth
 from octoseg_ti.view.scene import finite_rows
 from octoseg_ti.view.stream import replaced
 
@@ -62,6 +62,8 @@ def sections(
         _grid(result),
         _patches(result),
     ]
+    if result.registration is not None:
+        out.append(_registration(result.registration))
     if scores is not None:
         out += _scores(scores)
     out.append(_environment(arch))
@@ -97,6 +99,22 @@ def _measured(result: Segmentation) -> Section:
             ("deviation of the normals", f"{math.degrees(m.normal_noise):.3g} deg"),
         ],
     )
+
+
+def _registration(aligned: Registration) -> Section:
+    rows = [
+        (f"{a} - {b}", f"{count:,}", f"{before:.4f}", f"{after:.4f}")
+        for (a, b), count, before, after in zip(
+            aligned.pairs.tolist(), aligned.matches, aligned.before, aligned.after, strict=True
+        )
+    ]
+    moves = [
+        f"view {v}: {shift:.4f} mm, {math.degrees(angle):.4f} deg"
+        for v, (shift, angle) in enumerate(zip(*aligned.moves(), strict=True))
+    ]
+    texts = [f"{aligned}.", "The poses were moved by: " + "; ".join(moves) + "."]
+    head = ("views", "matched points", "rms before [mm]", "rms after [mm]")
+    return Section(title="Registration", paragraphs=texts, head=head, rows=rows)
 
 
 def _parameters(result: Segmentation) -> Section:
