@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from octoseg_ti.errors import DataError
-from octoseg_ti.types import Scans, Truth
-from scanner_sim.quadric import gradient
-from scanner_sim.raycast import cast
+from octoseg_ti.types import NONE, Artefact, Scans, Truth
+from scanner_sim.bounce import add_bounces
+from scanner_sim.effects import Stream, quantised, range_errors, stream
+from scanner_sim.line_kernel import peaks_of_solid
+from scanner_sim.line_profile import Fan, Peaks, peaks
+from scanner_sim.optics import noise_law
+from scanner_sim.part import FlatPart
 from scanner_sim.scanner import DEFAULT_VIEWS, StripeScanner, View
+from scanner_sim.stage import stage_error
 from scanner_sim.truth import build_truth
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from scanner_sim.part import FlatPart, Part
+    from scanner_sim.part import Part
 
 _TRIAL_RAYS = 40_000
 _SURPLUS = 1.01  # aim this far above the wanted number; what is too much is thinned out
-_LIFT = 1e-6  # shadow rays start this far above the surface [mm]
 _ATTEMPTS = 6
+_CHUNK = 1 << 18  # rays that are followed at once, where arrays of them all exist
+_SHARE = 0.5  # a point this share of the stated noise off its place has an artefact
+_EXACT = 1e-3  # ... but no point that is closer than this [mm]
 
 
 class _Pass(NamedTuple):
@@ -39,6 +47,20 @@ class _Pass(NamedTuple):
     surface: np.ndarray
     sight: np.ndarray
     """Direction of the laser's ray, world, unit."""
+    length: np.ndarray
+    """Measured distance from the laser [mm], without noise."""
+    fall: np.ndarray
+    """Depth below the laser for a unit of the ray's length."""
+    cosine: np.ndarray
+    """Cosine between laser and normal."""
+    camera_cosine: np.ndarray
+    """Cosine between the line to the camera and the normal."""
+    excess: np.ndarray
+    """Brightness at the middle of the peak."""
+    artefact: np.ndarray
+    """`Artefact` of the point."""
+    shape: tuple[int, int]
+    """Stripes and rays of a stripe."""
 
 
 def simulate(
@@ -50,9 +72,16 @@ def simulate(
 ) -> tuple[Scans, Truth]:
     """Scan a part, and say what is true about every point.
 
-    A point exists where the laser's ray first meets the part, if the camera sees that place too
-    (both shadows), at an angle that both bear. The same arguments give the same arrays, on any
-    number of threads.
+    A point exists where the laser's line first meets the part, if the camera sees that place too
+    (both shadows), at an angle that both bear. A line with a width and the other effects of
+    `StripeScanner` are measured as a probe does: by the peak of the light in every row of its
+    detector. The same arguments give the same arrays, on any number of threads.
+
+    Artefacts: the true place of a mixed point is that of the line's middle ray, or of its brightest
+    one where the middle one is not in the peak; a spike's is where the laser of its row meets the
+    part, and it is in no patch. A point is clean when the peak, noise aside, lies within half the
+    stated noise (`scanner_sim.optics.noise_law`) or a micrometre of its true surface, along the
+    line of sight.
 
     Args:
         part: The solid, in mm.
@@ -78,11 +107,11 @@ def simulate(
     for _ in range(_ATTEMPTS):
         passes = []
         for v, view in enumerate(views):
-            passes.append(_scan(flat, part.box, scanner, view, across, along))
+            passes.append(_scan(flat, part.box, scanner, view, across, along, (seed, v)))
             report("scan", (v + 1) / len(views))
         root = np.random.SeedSequence(seed)
         generators = [np.random.default_rng(s) for s in root.spawn(len(views) + 1)]
-        keep = [_losses(p, scanner, g) for p, g in zip(passes, generators, strict=False)]
+        keep = [_losses(p, scanner, generators[v], (seed, v)) for v, p in enumerate(passes)]
         count = int(sum(k.sum() for k in keep))
         if not (free and wanted) or wanted <= count <= 1.05 * wanted or count == 0:
             break
@@ -96,7 +125,7 @@ def simulate(
     exact = wanted if free else scanner.points
     if exact is not None:
         _thin(keep, exact, generators[-1])
-    scans = _assemble(passes, keep, scanner, views, part, generators)
+    scans = _assemble(passes, keep, scanner, views, part, generators, seed, along)
     report("truth", 0.0)
     assert scans.stripe is not None and scans.column is not None
     truth = build_truth(
@@ -113,10 +142,26 @@ def simulate(
             "range_noise_mm": repr(scanner.range_noise),
             "stripe_pitch_mm": repr(across),
             "point_pitch_mm": repr(along),
+            **{name: repr(getattr(scanner, name)) for name in scanner.effects},
         },
     )
+    if scanner.effects:
+        truth = _with_artefacts(
+            truth, np.concatenate([p.artefact[k] for p, k in zip(passes, keep, strict=True)])
+        )
     report("truth", 1.0)
     return scans, truth
+
+
+def _with_artefacts(truth: Truth, artefact: np.ndarray) -> Truth:
+    """Return the truth with artefacts; spikes leave their patches, which are ordered anew."""
+    patch = np.where(artefact == Artefact.SPIKE, NONE, truth.patch).astype(np.int32)
+    size = np.bincount(patch[patch >= 0], minlength=truth.patch_count)
+    rank = np.full(len(size) + 1, NONE, np.int32)
+    order = np.argsort(-size, kind="stable")
+    order = order[size[order] > 0]
+    rank[order] = np.arange(len(order))
+    return dataclasses.replace(truth, patch=rank[patch], artefact=artefact)
 
 
 def _pitches(
@@ -138,7 +183,10 @@ def _pitches(
     across = math.sqrt(area / _TRIAL_RAYS * scanner.aspect)
     if wanted is None:
         return across, across / scanner.aspect
-    trial = [_scan(flat, limits, scanner, view, across, across / scanner.aspect) for view in views]
+    trial = [
+        _scan(flat, limits, scanner, view, across, across / scanner.aspect, (0, v))
+        for v, view in enumerate(views)
+    ]
     # Points go with the square of the fineness, ends of stripes (lost ones) only linearly.
     points = float(sum(len(scan.stripe) for scan in trial))
     points *= (1.0 - scanner.dropout) * (1.0 - scanner.lost_stripes)
@@ -180,47 +228,79 @@ def _scan(
     view: View,
     across: float,
     along: float,
+    seeds: tuple[int, int],
 ) -> _Pass:
-    """Return all points that laser and camera both see, in scan order, without noise and losses."""
+    """Return all points that laser and camera both see, in scan order, without noise and losses.
+
+    Args:
+        flat: The solid.
+        limits: Its box [mm], shape (2, 3).
+        scanner: The scanner.
+        view: The direction of the pass.
+        across: Distance of the stripes [mm].
+        along: Distance of the rays [mm].
+        seeds: Seed of the simulation and number of the view, for the errors of the stage.
+    """
     rotation = view.rotation()
     middle = limits.mean(axis=0)
     low, high = _extent(limits, scanner, view)
     x = _spread(low[0], high[0], across)
     y = _spread(low[1], high[1], along)
     stripes, columns = len(x), len(y)
-    source = np.stack([x, np.zeros(stripes), np.full(stripes, scanner.stand_off)], axis=1)
     ray = np.stack([np.zeros(columns), y, np.full(columns, -scanner.stand_off)], axis=1)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    source_world = source @ rotation.T + middle
-    ray_world = ray @ rotation.T
-    origins = np.repeat(source_world, columns, axis=0)
-    directions = np.tile(ray_world, (stripes, 1))
-    hits = cast(flat, origins, directions, np.full(len(origins), math.inf))
-    found = np.flatnonzero(hits.surface >= 0)
-    surface = hits.surface[found]
-    sight = directions[found]
-    position = origins[found] + hits.distance[found, None] * sight
-    normal = gradient(flat.surfaces, surface, position) * hits.side[found, None]
-    stripe, column = found // columns, found % columns
-    camera = (source[stripe] + scanner.camera) @ rotation.T + middle
-    to_camera = camera - position
-    far = np.linalg.norm(to_camera, axis=1)
-    to_camera /= far[:, None]
-    seen = -np.einsum("ij,ij->i", normal, sight) >= math.cos(scanner.incidence_limit)
-    seen &= np.einsum("ij,ij->i", normal, to_camera) >= math.cos(scanner.camera_limit)
-    if scanner.depth_of_field is not None:
-        height = (position - middle) @ rotation[:, 2]
-        seen &= np.abs(height) <= scanner.depth_of_field / 2
-    open_ = np.flatnonzero(seen)
-    shadow = cast(
-        flat, position[open_] + _LIFT * normal[open_], to_camera[open_], far[open_], any_hit=True
-    )
-    chosen = open_[shadow.surface < 0]
+    nominal = _sources(x, scanner, rotation, middle)
+    off = stage_error(scanner, x, stream(*seeds, Stream.JITTER), stream(*seeds, Stream.PERIOD))
+    fan = Fan(_sources(x + off, scanner, rotation, middle), ray @ rotation.T, rotation)
+    found = _peaks(flat, scanner, fan, middle)
+    mark = np.zeros(len(found.ray), np.uint8)
+    if scanner.specular > 0.0:
+        found, mark = add_bounces(flat, scanner, fan, middle, y, found)
+    if scanner.threshold > 0.0:
+        bright = found.light >= scanner.threshold
+        found, mark = Peaks(*(column[bright] for column in found)), mark[bright]
+    stripe, column = found.ray // columns, found.ray % columns
+    sight = fan.ray[column]
+    to_camera = fan.source[stripe] + rotation @ scanner.camera - found.position
+    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+    # A spike's true place may be one that could not be measured, edge on.
+    cosine = np.maximum(-np.einsum("ij,ij->i", found.normal, sight), 0.02)
+    camera_cosine = np.maximum(np.einsum("ij,ij->i", found.normal, to_camera), 0.02)
+    reached = fan.source[stripe] + found.length[:, None] * sight
+    off_surface = np.abs(np.einsum("ij,ij->i", reached - found.position, found.normal)) / cosine
+    law = noise_law(scanner, cosine, camera_cosine, found.excess)
+    wrong = off_surface > np.maximum(_SHARE * law, _EXACT)
+    mark = np.where(wrong & (mark == Artefact.CLEAN), np.uint8(Artefact.MIXED), mark)
     return _Pass(
-        stripe=stripe[chosen].astype(np.int32), column=column[chosen].astype(np.int32),
-        source=source_world, position=position[chosen], normal=normal[chosen],
-        surface=surface[chosen], sight=sight[chosen],
+        stripe=stripe.astype(np.int32), column=column.astype(np.int32), source=nominal,
+        position=found.position, normal=found.normal, surface=found.surface, sight=sight,
+        length=found.length, fall=-sight @ rotation[:, 2], cosine=cosine,
+        camera_cosine=camera_cosine, excess=found.excess,
+        artefact=np.where(wrong, mark, np.uint8(Artefact.CLEAN)), shape=(stripes, columns),
     )  # fmt: skip
+
+
+def _sources(
+    x: np.ndarray, scanner: StripeScanner, rotation: np.ndarray, middle: np.ndarray
+) -> np.ndarray:
+    """Return positions of the laser [mm], world, shape (S, 3)."""
+    source = np.stack([x, np.zeros(len(x)), np.full(len(x), scanner.stand_off)], axis=1)
+    world: np.ndarray = source @ rotation.T + middle
+    return world
+
+
+def _peaks(flat: FlatPart, scanner: StripeScanner, fan: Fan, middle: np.ndarray) -> Peaks:
+    """Return the peaks of all stripes, in bounded memory."""
+    if scanner.effects and isinstance(flat, FlatPart):
+        return peaks_of_solid(flat, scanner, fan, middle)
+    columns = len(fan.ray)
+    step = max(_CHUNK // columns, 1)
+    pieces = []
+    for start in range(0, len(fan.source), step):
+        part = fan._replace(source=fan.source[start : start + step])
+        found = peaks(flat, scanner, part, middle)
+        pieces.append(found._replace(ray=found.ray + start * columns))
+    return Peaks(*(np.concatenate(column) for column in zip(*pieces, strict=True)))
 
 
 def _spread(low: float, high: float, pitch: float) -> np.ndarray:
@@ -229,12 +309,24 @@ def _spread(low: float, high: float, pitch: float) -> np.ndarray:
     return 0.5 * (low + high) + pitch * (np.arange(count) - 0.5 * (count - 1))
 
 
-def _losses(scan: _Pass, scanner: StripeScanner, generator: np.random.Generator) -> np.ndarray:
-    """Return which points arrive: without lost stripes, ragged ends and single losses."""
+def _losses(
+    scan: _Pass, scanner: StripeScanner, generator: np.random.Generator, seeds: tuple[int, int]
+) -> np.ndarray:
+    """Return which points arrive: without lost stripes, ragged ends and single losses.
+
+    A scanner without further effects draws them and the noise from one generator; the others have
+    a stream for each loss, with a draw for every ray.
+    """
     count, stripes = len(scan.stripe), len(scan.source)
-    lines = generator.random(stripes) >= scanner.lost_stripes
-    trim = generator.poisson(scanner.lost_ends, (2, stripes))
-    single = generator.random(count) >= scanner.dropout
+    if scanner.effects:
+        lines = stream(*seeds, Stream.STRIPES).random(stripes) >= scanner.lost_stripes
+        trim = stream(*seeds, Stream.ENDS).poisson(scanner.lost_ends, (2, stripes))
+        draws = stream(*seeds, Stream.SINGLE).random(scan.shape)
+        single = draws[scan.stripe, scan.column] >= scanner.dropout
+    else:
+        lines = generator.random(stripes) >= scanner.lost_stripes
+        trim = generator.poisson(scanner.lost_ends, (2, stripes))
+        single = generator.random(count) >= scanner.dropout
     starts = np.searchsorted(scan.stripe, np.arange(stripes))
     ends = np.searchsorted(scan.stripe, np.arange(stripes), side="right")
     place = np.arange(count)
@@ -262,7 +354,7 @@ def _thin(keep: list[np.ndarray], wanted: int, generator: np.random.Generator) -
 
 def _assemble(
     passes: list[_Pass], keep: list[np.ndarray], scanner: StripeScanner, views: tuple[View, ...],
-    part: Part, generators: list[np.random.Generator],
+    part: Part, generators: list[np.random.Generator], seed: int, along: float,
 ) -> Scans:  # fmt: skip
     """Return the scans: noise along the line of sight, points in the frames of their views."""
     middle = part.box.mean(axis=0)
@@ -272,8 +364,11 @@ def _assemble(
     for v, (scan, chosen) in enumerate(zip(passes, keep, strict=True)):
         poses[v, :3, :3] = views[v].rotation()
         poses[v, :3, 3] = middle
-        noise = generators[v].normal(0.0, scanner.range_noise, int(chosen.sum()))
-        world = scan.position[chosen] + noise[:, None] * scan.sight[chosen]
+        if scanner.effects:
+            world = _measured(scan, chosen, scanner, (seed, v), along)
+        else:
+            noise = generators[v].normal(0.0, scanner.range_noise, int(chosen.sum()))
+            world = scan.position[chosen] + noise[:, None] * scan.sight[chosen]
         points.append((world - middle) @ poses[v, :3, :3])
         stripe.append(scan.stripe[chosen] + first)
         columns = int(scan.column.max(initial=0)) + 1
@@ -294,3 +389,21 @@ def _assemble(
         frame="view",
         name=part.name,
     )
+
+
+def _measured(
+    scan: _Pass, chosen: np.ndarray, scanner: StripeScanner, seeds: tuple[int, int], along: float
+) -> np.ndarray:
+    """Return where the scanner says that points are [mm], world, shape (N, 3).
+
+    Random errors come first, then the steps of the detector; the stage is where its scale says.
+    """
+    key = scan.stripe[chosen].astype(np.int64) * scan.shape[1] + scan.column[chosen]
+    error = range_errors(
+        scanner, seed=seeds[0], view=seeds[1], shape=scan.shape, chosen=key, along=along,
+        cosine=scan.cosine[chosen], camera_cosine=scan.camera_cosine[chosen],
+        excess=scan.excess[chosen],
+    )  # fmt: skip
+    length = quantised(scanner, scan.length[chosen] + error, scan.fall[chosen])
+    measured: np.ndarray = scan.source[scan.stripe[chosen]] + length[:, None] * scan.sight[chosen]
+    return measured
