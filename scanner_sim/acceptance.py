@@ -88,9 +88,14 @@ def acceptance(scanner: StripeScanner | None = None, *, seed: int = 0) -> Accept
 
 
 def step_part() -> Part:
-    """Return the step: 5 mm down at x = 0, towards the camera of a view from above."""
-    high = box((-20.0, -10.0, -STEP), (0.0, 10.0, STEP))
-    return union(high, box((0.0, -10.0, -STEP), (20.0, 10.0, 0.0)))
+    """Return the step: 5 mm up at x = 0, away from the camera of a view from above."""
+    return _step(20.0)
+
+
+def _step(half: float) -> Part:
+    """Return the step between two plates of a width [mm]."""
+    high = box((0.0, -10.0, -STEP), (half, 10.0, STEP))
+    return union(high, box((-half, -10.0, -STEP), (0.0, 10.0, 0.0)))
 
 
 def scan_of_step(scanner: StripeScanner, *, seed: int = 0) -> tuple[Scans, Truth]:
@@ -99,10 +104,7 @@ def scan_of_step(scanner: StripeScanner, *, seed: int = 0) -> tuple[Scans, Truth
         scanner, stripe_pitch=max(scanner.line_width / 12.0, 0.01), point_pitch=1.0, points=None,
         views=(View(),), aspect=1.0,
     )  # fmt: skip
-    narrow = union(
-        box((-2.0, -10.0, -STEP), (0.0, 10.0, STEP)), box((0.0, -10.0, -STEP), (2.0, 10.0, 0.0))
-    )
-    return simulate(narrow, fine, seed=seed)
+    return simulate(_step(2.0), fine, seed=seed)
 
 
 def noise_at(scanner: StripeScanner, tilt: float, *, seed: int = 0) -> NoiseRow:
