@@ -155,7 +155,10 @@ def fit_sphere(points: np.ndarray) -> tuple[float, np.ndarray]:
     centre = start[0][:3]
     radius = math.sqrt(start[0][3] + centre @ centre)
     fit = least_squares(
-        lambda v: np.linalg.norm(q - v[:3], axis=1) - v[3], [*centre, radius], xtol=1e-15, ftol=1e-15
+        lambda v: np.linalg.norm(q - v[:3], axis=1) - v[3],
+        [*centre, radius],
+        xtol=1e-15,
+        ftol=1e-15,
     )
     return float(fit.x[3]), fit.fun
 

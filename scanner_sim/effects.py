@@ -1,8 +1,8 @@
 """Random errors of a measured point, each drawn from a stream of its own.
 
-Draws are made for every ray of a pass, hit or not, in the order of the scan: so a point's noise does
-not depend on which other points there are, and an effect that is switched off leaves the draws of
-the others as they are.
+Draws are made for every ray of a pass, hit or not, in the order of the scan: so the noise of a
+point does not depend on which other points there are, and an effect that is switched off leaves
+the draws of the others as they are.
 """
 
 from __future__ import annotations
@@ -42,9 +42,7 @@ class Stream(IntEnum):
 
 def stream(seed: int, view: int, effect: Stream) -> np.random.Generator:
     """Return the generator of an effect in a view, independent of all others."""
-    return np.random.default_rng(
-        np.random.SeedSequence(seed, spawn_key=(view, int(effect)))
-    )
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(view, int(effect))))
 
 
 def grid_draws(
@@ -76,7 +74,9 @@ def grid_draws(
     for first in range(0, stripes, step):
         rows = min(step, stripes - first)
         white = generator.standard_normal((rows, width))
-        drawn = sum(w * white[:, k : k + columns] for k, w in enumerate(window))
+        drawn = np.zeros((rows, columns))
+        for k, weight in enumerate(window):
+            drawn += weight * white[:, k : k + columns]
         start, stop = np.searchsorted(chosen, [first * columns, (first + rows) * columns])
         result[start:stop] = drawn.ravel()[chosen[start:stop] - first * columns]
     return result

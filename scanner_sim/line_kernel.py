@@ -1,9 +1,10 @@
-"""The peaks of `scanner_sim.line_profile` for solids, in one kernel a chunk of stripes.
+"""The peaks of `scanner_sim.line_profile` for solids, in kernels over a chunk of stripes.
 
-All rays over the width of the line are followed and reduced to the peak on the spot, so arrays of
-all of them never exist. When the middle ray and the two outer ones meet the same surface, all three
-seen or all three not, the others between them are taken to do likewise, and are only cut with that
-surface: what is narrower than half the line may then be overlooked by one row.
+One follows the rays over the width of the line, one looks from their spots to the camera, one
+reduces them to the peak of every row; arrays of all rays exist for one chunk only. When the middle
+ray and the two outer ones meet the same surface, all three seen or all three not, the others
+between them are taken to do likewise, and are only cut with that surface: what is narrower than
+half the line may then be overlooked by one row.
 """
 
 import math
@@ -19,12 +20,12 @@ from scanner_sim.optics import merging, pixels_per_slope, shine, sub_rays
 from scanner_sim.part import FlatPart
 from scanner_sim.quadric import gradient
 from scanner_sim.raycast import crossings, nearest_hit
-from scanner_sim.scanner import MAX_SUB_RAYS, StripeScanner
+from scanner_sim.scanner import StripeScanner
 
 _PLANE, _CYLINDER = int(SurfaceKind.PLANE), int(SurfaceKind.CYLINDER)
 _CONE, _SPHERE = int(SurfaceKind.CONE), int(SurfaceKind.SPHERE)
 _FAR = 1e30
-_CHUNK = 1 << 19
+_CHUNK = 1 << 17
 
 
 @ti.dataclass
@@ -110,151 +111,6 @@ def _nearest_to(kind, data: ti.template(), s, origin, ray, wanted):
 
 
 @ti.func
-def _seen(optics: ti.template(), code: ti.template(), boxes: ti.template(), kinds: ti.template(),
-          data: ti.template(), origin, ray, camera, known):  # fmt: skip
-    """Return (distance, surface or -1, side, brightness) of the spot of one ray; 0 = not seen.
-
-    Args:
-        optics: The probe.
-        code: Program of the part.
-        boxes: Its boxes.
-        kinds: Kinds of its surfaces.
-        data: Its surfaces.
-        origin: Where the ray starts.
-        ray: Its direction.
-        camera: Position of the camera.
-        known: What a ray beside it has met, or a surface of -2: then all is looked for.
-    """
-    hit = vec3(known[0], known[1], known[2])
-    bright = 0.0
-    if known[1] < -1.5:
-        hit = nearest_hit(code, boxes, kinds, data, origin, ray, _FAR, 0)
-    elif known[3] > 0.0:
-        s = ti.i32(known[1])
-        hit[0] = _nearest_to(kinds[s], data, s, origin, ray, known[0])
-    surface = ti.i32(hit[1])
-    if surface >= 0 and (known[1] < -1.5 or known[3] > 0.0):
-        place = origin + hit[0] * ray
-        normal = hit[2] * _normal(kinds[surface], data, surface, place)
-        back = camera - place
-        far = back.norm()
-        back = back / far
-        depth = hit[0] * ray.dot(optics.down)
-        if (
-            -normal.dot(ray) >= optics.least_incidence
-            and normal.dot(back) >= optics.least_camera
-            and ti.abs(optics.stand_off - depth) <= optics.half_depth
-        ):
-            bright = optics.brightness(ray, normal, back)
-            if known[1] < -1.5:
-                start = place + LIFT * normal
-                if nearest_hit(code, boxes, kinds, data, start, back, far, 1)[1] > -0.5:
-                    bright = 0.0
-    return ti.Vector([hit[0], hit[1], hit[2], bright])
-
-
-@ti.func
-def _peak(optics: ti.template(), place: ti.template(), bright: ti.template(),
-          line: ti.template()):  # fmt: skip
-    """Return (centroid, number of the spot that stands for it, brightness, excess) of a profile."""
-    count = line.shape[0]
-    middle = count // 2
-    order = ti.Vector([0] * MAX_SUB_RAYS)
-    seen = 0
-    for k in range(count):
-        if bright[k] > 0.0:
-            at = seen
-            while at > 0 and place[order[ti.max(at - 1, 0)]] > place[k]:
-                order[at] = order[at - 1]
-                at -= 1
-            order[at] = k
-            seen += 1
-    top = line[middle, 1]
-    first, best_first, best_last = 0, 0, -1
-    total, best_total = 0.0, -1.0
-    for n in range(seen):
-        k = order[n]
-        if n > 0 and place[k] - place[order[ti.max(n - 1, 0)]] > optics.gap:
-            first = n
-            total = 0.0
-        total += top * ti.min(bright[k] * line[k, 1] / top, optics.full)
-        if total > best_total:
-            best_first, best_last, best_total = first, n, total
-    moment, light, excess, strongest = 0.0, 0.0, 0.0, -1.0
-    spot = -1
-    start = place[order[best_first]]
-    for n in range(best_first, best_last + 1):
-        k = order[n]
-        shown = bright[k] * line[k, 1] / top
-        weight = top * ti.min(shown, optics.full)
-        moment += weight * (place[k] - start)
-        light += bright[k] * line[k, 1]
-        excess = ti.max(excess, shown)
-        if spot != middle and (k == middle or weight > strongest):
-            spot = k
-            strongest = weight
-    return ti.Vector([start + moment / best_total, ti.f64(spot), light, excess])
-
-
-@ti.kernel
-def _find_peaks(
-    optics: Optics,
-    # In:
-    code_in: I32Rows,
-    boxes_in: F64Rows,
-    kinds_in: I32Array,
-    data_in: F64Rows,
-    sources_in: F64Rows,
-    rays_in: F64Rows,
-    line_in: F64Rows,
-    # Out:
-    value_out: F64Rows,
-    hit_out: I32Rows,
-):
-    """Follow the rays over the line's width for every stripe and row, and find the peak."""
-    for i in range(sources_in.shape[0] * rays_in.shape[0]):
-        source = row(sources_in, i // rays_in.shape[0])
-        ray = row(rays_in, i % rays_in.shape[0])
-        camera = source + optics.camera
-        count = line_in.shape[0]
-        place = ti.Vector([0.0] * MAX_SUB_RAYS)
-        bright = ti.Vector([0.0] * MAX_SUB_RAYS)
-        far = ti.Vector([0.0] * MAX_SUB_RAYS)
-        face = ti.Vector([-1] * MAX_SUB_RAYS)
-        side = ti.Vector([0] * MAX_SUB_RAYS)
-        for turn in range(count):
-            k = _turn(turn, count)
-            origin = source + line_in[k, 0] * optics.across
-            known = ti.Vector([0.0, -2.0, 0.0, 0.0])
-            middle, last = count // 2, count - 1
-            if turn >= 3:
-                alike = face[0] == face[middle] and face[last] == face[middle]
-                alike = alike and side[0] == side[middle] and side[last] == side[middle]
-                lit = bright[middle] > 0.0
-                alike = alike and (bright[0] > 0.0) == lit and (bright[last] > 0.0) == lit
-                if alike:
-                    known = ti.Vector(
-                        [far[middle], ti.f64(face[middle]), ti.f64(side[middle]), bright[middle]]
-                    )
-            spot = _seen(
-                optics, code_in, boxes_in, kinds_in, data_in, origin, ray, camera, known
-            )  # fmt: skip
-            far[k], face[k], side[k], bright[k] = (
-                spot[0], ti.i32(spot[1]), ti.i32(spot[2]), spot[3]
-            )  # fmt: skip
-            place[k] = optics.place(spot[0] * ray.dot(optics.down), line_in[k, 0])
-        peak = _peak(optics, place, bright, line_in)
-        spot_index = ti.i32(peak[1])
-        value_out[i, 0] = optics.depth(peak[0]) / ray.dot(optics.down)
-        value_out[i, 1] = far[ti.max(spot_index, 0)]
-        value_out[i, 2] = peak[2]
-        value_out[i, 3] = peak[3]
-        hit_out[i, 0] = spot_index
-        hit_out[i, 1] = face[ti.max(spot_index, 0)]
-        hit_out[i, 2] = side[ti.max(spot_index, 0)]
-
-
-@ti.func
 def _turn(turn, count):
     """Return the ray whose turn it is: the middle one, the outer two, then those between."""
     k = turn - 2 if turn - 2 < count // 2 else turn - 1
@@ -265,6 +121,182 @@ def _turn(turn, count):
     elif turn == 2:
         k = count - 1
     return k
+
+
+@ti.func
+def _alike(spots: ti.template(), i, middle, last):
+    """Say whether the middle ray and the outer two met one surface, and are all seen or all not."""
+    same = True
+    for n in ti.static((1, 2)):
+        here = spots[i, middle + n]
+        same = same and spots[i, n] == here and spots[i, last + n] == here
+    lit = spots[i, middle + 3] > 0.0
+    return same and (spots[i, 3] > 0.0) == lit and (spots[i, last + 3] > 0.0) == lit
+
+
+@ti.func
+def _brightness(optics: ti.template(), kinds: ti.template(), data: ti.template(),
+                hit, origin, ray, camera):  # fmt: skip
+    """Return the brightness of what a ray has met; 0 beyond the limits of the scanner."""
+    bright = 0.0
+    surface = ti.i32(hit[1])
+    if surface >= 0:
+        place = origin + hit[0] * ray
+        normal = hit[2] * _normal(kinds[surface], data, surface, place)
+        back = (camera - place).normalized()
+        depth = hit[0] * ray.dot(optics.down)
+        if (
+            -normal.dot(ray) >= optics.least_incidence
+            and normal.dot(back) >= optics.least_camera
+            and ti.abs(optics.stand_off - depth) <= optics.half_depth
+        ):
+            bright = optics.brightness(ray, normal, back)
+    return bright
+
+
+@ti.kernel
+def _follow_rays(
+    optics: Optics,
+    first: ti.i32,
+    stop: ti.i32,
+    # In:
+    code_in: I32Rows,
+    boxes_in: F64Rows,
+    kinds_in: I32Array,
+    data_in: F64Rows,
+    sources_in: F64Rows,
+    rays_in: F64Rows,
+    line_in: F64Rows,
+    # Out:
+    spots_inout: F64Rows,
+):
+    """Write distance, surface, side and brightness of the rays whose turn it is, four a ray.
+
+    The brightness is negative as long as nobody has looked from the spot to the camera.
+    """
+    for i in range(sources_in.shape[0] * rays_in.shape[0]):
+        ray = row(rays_in, i % rays_in.shape[0])
+        source = row(sources_in, i // rays_in.shape[0])
+        count = line_in.shape[0]
+        middle = 4 * (count // 2)
+        known = first >= 3 and _alike(spots_inout, i, middle, 4 * (count - 1))
+        lit = spots_inout[i, middle + 3] > 0.0
+        for turn in range(first, stop):
+            k = 4 * _turn(turn, count)
+            origin = source + line_in[k // 4, 0] * optics.across
+            hit = vec3(_FAR, -1.0, 0.0)
+            if not known:
+                hit = nearest_hit(code_in, boxes_in, kinds_in, data_in, origin, ray, _FAR, 0)
+            elif lit:
+                hit = vec3(0.0, spots_inout[i, middle + 1], spots_inout[i, middle + 2])
+                s = ti.i32(hit[1])
+                far = spots_inout[i, middle]
+                hit[0] = _nearest_to(kinds_in[s], data_in, s, origin, ray, far)
+            bright = _brightness(
+                optics, kinds_in, data_in, hit, origin, ray, source + optics.camera
+            )  # fmt: skip
+            for n in ti.static(range(3)):
+                spots_inout[i, k + n] = hit[n]
+            spots_inout[i, k + 3] = bright if known else -bright
+
+
+@ti.kernel
+def _look_back(
+    optics: Optics,
+    first: ti.i32,
+    stop: ti.i32,
+    # In:
+    code_in: I32Rows,
+    boxes_in: F64Rows,
+    kinds_in: I32Array,
+    data_in: F64Rows,
+    sources_in: F64Rows,
+    rays_in: F64Rows,
+    line_in: F64Rows,
+    # Out:
+    spots_inout: F64Rows,
+):
+    """Make the brightness positive where the camera sees the spot, and 0 where it does not."""
+    for i in range(sources_in.shape[0] * rays_in.shape[0]):
+        ray = row(rays_in, i % rays_in.shape[0])
+        source = row(sources_in, i // rays_in.shape[0])
+        for turn in range(first, stop):
+            k = 4 * _turn(turn, line_in.shape[0])
+            if spots_inout[i, k + 3] < 0.0:
+                surface = ti.i32(spots_inout[i, k + 1])
+                place = source + line_in[k // 4, 0] * optics.across + spots_inout[i, k] * ray
+                normal = _normal(kinds_in[surface], data_in, surface, place)
+                back = source + optics.camera - place
+                far = back.norm()
+                start = place + LIFT * spots_inout[i, k + 2] * normal
+                hit = nearest_hit(
+                    code_in, boxes_in, kinds_in, data_in, start, back / far, far, 1
+                )  # fmt: skip
+                bright = -spots_inout[i, k + 3]
+                spots_inout[i, k + 3] = 0.0 if hit[1] > -0.5 else bright
+
+
+@ti.kernel
+def _find_peaks(
+    optics: Optics,
+    # In:
+    rays_in: F64Rows,
+    line_in: F64Rows,
+    spots_in: F64Rows,
+    # Out:
+    place_out: F64Rows,
+    order_out: I32Rows,
+    value_out: F64Rows,
+    hit_out: I32Rows,
+):
+    """Find the brightest group of spots of every row, and its centroid.
+
+    Values are measured and true distance, brightness and excess; hits are spot, surface, side.
+    """
+    for i in range(spots_in.shape[0]):
+        ray = row(rays_in, i % rays_in.shape[0])
+        fall = ray.dot(optics.down)
+        count = line_in.shape[0]
+        middle = count // 2
+        top = line_in[middle, 1]
+        seen = 0
+        for k in range(count):
+            place_out[i, k] = optics.place(spots_in[i, 4 * k] * fall, line_in[k, 0])
+            if spots_in[i, 4 * k + 3] > 0.0:
+                at = seen
+                while at > 0 and place_out[i, order_out[i, ti.max(at - 1, 0)]] > place_out[i, k]:
+                    order_out[i, at] = order_out[i, at - 1]
+                    at -= 1
+                order_out[i, at] = k
+                seen += 1
+        first, best_first, best_last, total, best_total = 0, 0, -1, 0.0, -1.0
+        for n in range(seen):
+            k = order_out[i, n]
+            before = order_out[i, ti.max(n - 1, 0)]
+            if n > 0 and place_out[i, k] - place_out[i, before] > optics.gap:
+                first, total = n, 0.0
+            total += top * ti.min(spots_in[i, 4 * k + 3] * line_in[k, 1] / top, optics.full)
+            if total > best_total:
+                best_first, best_last, best_total = first, n, total
+        hit_out[i, 0] = -1
+        if seen > 0:
+            start = place_out[i, order_out[i, best_first]]
+            moment, light, excess, strongest, spot = 0.0, 0.0, 0.0, -1.0, -1
+            for n in range(best_first, best_last + 1):
+                k = order_out[i, n]
+                shown = spots_in[i, 4 * k + 3] * line_in[k, 1] / top
+                weight = top * ti.min(shown, optics.full)
+                moment += weight * (place_out[i, k] - start)
+                light += shown * top
+                excess = ti.max(excess, shown)
+                if spot != middle and (k == middle or weight > strongest):
+                    spot, strongest = k, weight
+            value_out[i, 0] = optics.depth(start + moment / best_total) / fall
+            value_out[i, 1] = spots_in[i, 4 * spot]
+            value_out[i, 2], value_out[i, 3] = light, excess
+            hit_out[i, 0] = spot
+            for n in ti.static((1, 2)):
+                hit_out[i, n] = ti.i32(spots_in[i, 4 * spot + n])
 
 
 def peaks_of_solid(target: FlatPart, scanner: StripeScanner, fan: Fan, middle: np.ndarray) -> Peaks:
@@ -282,9 +314,19 @@ def peaks_of_solid(target: FlatPart, scanner: StripeScanner, fan: Fan, middle: n
     pieces = []
     for start in range(0, len(fan.source), step):
         source = fan.source[start : start + step]
-        value = runtime.empty((len(source) * columns, 4), np.float64)
-        hit = runtime.empty((len(source) * columns, 3), np.int32)
-        _find_peaks(optics, *part[:4], runtime.upload(source), part[4], line, value, hit)
+        rows = len(source) * columns
+        value = runtime.empty((rows, 4), np.float64)
+        hit = runtime.empty((rows, 3), np.int32)
+        spots = runtime.empty((rows, 4 * len(offsets)), np.float64)
+        rays = (*part[:4], runtime.upload(source), part[4], line, spots)
+        # The outer rays and the middle one first; the others follow them where they agree.
+        for first, stop in ((0, min(3, len(offsets))), (3, len(offsets))):
+            if first < stop:
+                _follow_rays(optics, first, stop, *rays)
+                _look_back(optics, first, stop, *rays)
+        place = runtime.empty((rows, len(offsets)), np.float64)
+        order = runtime.empty((rows, len(offsets)), np.int32)
+        _find_peaks(optics, part[4], line, spots, place, order, value, hit)
         runtime.sync()
         pieces.append(_gather(target, fan, source, offsets, start, value, hit))
     return Peaks(*(np.concatenate(column) for column in zip(*pieces, strict=True)))

@@ -122,9 +122,11 @@ def peaks(target: FlatPart, scanner: StripeScanner, fan: Fan, middle: np.ndarray
     offsets, shares = sub_rays(scanner)
     origins = np.repeat(fan.source, len(fan.ray), axis=0)
     directions = np.tile(fan.ray, (len(fan.source), 1))
-    cameras = np.repeat(
-        (fan.source - middle) @ fan.rotation + scanner.camera, len(fan.ray), axis=0
-    ) @ fan.rotation.T + middle
+    cameras = (
+        np.repeat((fan.source - middle) @ fan.rotation + scanner.camera, len(fan.ray), axis=0)
+        @ fan.rotation.T
+        + middle
+    )
     heights = np.stack([middle, fan.rotation[:, 2]])
     across = fan.rotation[:, 0]
     spots = [

@@ -1,4 +1,4 @@
-"""Verb `acceptance`: what a simulated scanner measures on a ball, a plane, a step, tilted plates."""
+"""Verb `acceptance`: what a simulated scanner measures on a ball, a plane and a step."""
 
 from __future__ import annotations
 

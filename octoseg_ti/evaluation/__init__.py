@@ -25,7 +25,13 @@ from octoseg_ti.evaluation.points import (
     score_edges,
     score_normals,
 )
-from octoseg_ti.evaluation.scores import ArtefactScores, EdgeScores, NormalScores, RegionScores, Scores
+from octoseg_ti.evaluation.scores import (
+    ArtefactScores,
+    EdgeScores,
+    NormalScores,
+    RegionScores,
+    Scores,
+)
 from octoseg_ti.types import EdgeClass, Truth
 
 __all__ = [

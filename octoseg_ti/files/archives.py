@@ -84,8 +84,8 @@ def pack_truth(truth: Truth, points: np.ndarray) -> bytes:
     """Return ``ground_truth.npz``: every array of the truth in point order, without loss.
 
     ``patch``, ``surface``, ``kind``, ``edge_distance``, ``edge_class``, ``artefact`` are stored as
-    they are; ``position_byte0`` to 7 and ``normal_byte0`` to 7, each (N, 3) u8, hold the bytes of the f64
-    rows, lowest first, the positions XOR those of ``points``. This halves the file.
+    they are; ``position_byte0`` to 7 and ``normal_byte0`` to 7, each (N, 3) u8, hold the bytes of
+    the f64 rows, lowest first, the positions XOR those of ``points``. This halves the file.
 
     Args:
         truth: The truth.
