@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from scanner_sim import blocks
     from scanner_sim.part import Part, box, cone, cylinder, half_space, rod, sphere, torus
     from scanner_sim.scanner import StripeScanner, View
-    from scanner_sim.simulate import simulate
+    from scanner_sim.simulate import measure, simulate
 
 _HOME = {
     "Part": "part",
@@ -20,6 +20,7 @@ _HOME = {
     "cone": "part",
     "cylinder": "part",
     "half_space": "part",
+    "measure": "simulate",
     "rod": "part",
     "simulate": "simulate",
     "sphere": "part",
@@ -35,6 +36,7 @@ __all__ = [
     "cone",
     "cylinder",
     "half_space",
+    "measure",
     "rod",
     "simulate",
     "sphere",
@@ -45,10 +47,12 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import a public name from the module that holds it."""
     if name in _HOME:
-        value = getattr(import_module(f"scanner_sim.{_HOME[name]}"), name)
+        module = import_module(f"scanner_sim.{_HOME[name]}")
         # The import has bound the module `simulate` to the package; the function must win.
-        globals()[name] = value
-        return value
+        for known, home in _HOME.items():
+            if home == _HOME[name]:
+                globals()[known] = getattr(module, known)
+        return globals()[name]
     if name == "blocks":
         return import_module("scanner_sim.blocks")
     raise AttributeError(f"module 'scanner_sim' has no attribute {name!r}")

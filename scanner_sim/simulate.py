@@ -98,6 +98,47 @@ def simulate(
     """
     scanner = scanner or StripeScanner()
     report = progress or (lambda name, done: None)
+    scans, passes, keep, across, along = _deliver(part, scanner, seed, report)
+    report("truth", 0.0)
+    assert scans.stripe is not None and scans.column is not None
+    truth = build_truth(
+        part.flat(),
+        position=np.concatenate([p.position[k] for p, k in zip(passes, keep, strict=True)]),
+        normal=np.concatenate([p.normal[k] for p, k in zip(passes, keep, strict=True)]),
+        surface=np.concatenate([p.surface[k] for p, k in zip(passes, keep, strict=True)]),
+        stripe=scans.stripe,
+        column=scans.column,
+        reach=2.0 * max(across, along) / max(math.cos(scanner.incidence_limit), 0.3),
+        info={
+            "part": part.name,
+            "seed": str(seed),
+            "range_noise_mm": repr(scanner.range_noise),
+            "stripe_pitch_mm": repr(across),
+            "point_pitch_mm": repr(along),
+            **{name: repr(getattr(scanner, name)) for name in scanner.effects},
+        },
+    )
+    if scanner.effects:
+        truth = _with_artefacts(
+            truth, np.concatenate([p.artefact[k] for p, k in zip(passes, keep, strict=True)])
+        )
+    report("truth", 1.0)
+    return scans, truth
+
+
+def measure(part: Part, scanner: StripeScanner, *, seed: int = 0) -> Scans:
+    """Return the scans of `simulate` alone, for who does without the truth: several times faster.
+
+    Raises:
+        DataError: As `simulate`.
+    """
+    return _deliver(part, scanner, seed, lambda name, done: None)[0]
+
+
+def _deliver(
+    part: Part, scanner: StripeScanner, seed: int, report: Callable[[str, float], None]
+) -> tuple[Scans, list[_Pass], list[np.ndarray], float, float]:
+    """Return the scans, all passes, which of their points arrive, stripe and point pitch [mm]."""
     flat = part.flat()
     views = scanner.views or part.views or DEFAULT_VIEWS
     wanted = scanner.points or part.nominal_points
@@ -126,31 +167,7 @@ def simulate(
     if exact is not None:
         _thin(keep, exact, generators[-1])
     scans = _assemble(passes, keep, scanner, views, part, generators, seed, along)
-    report("truth", 0.0)
-    assert scans.stripe is not None and scans.column is not None
-    truth = build_truth(
-        flat,
-        position=np.concatenate([p.position[k] for p, k in zip(passes, keep, strict=True)]),
-        normal=np.concatenate([p.normal[k] for p, k in zip(passes, keep, strict=True)]),
-        surface=np.concatenate([p.surface[k] for p, k in zip(passes, keep, strict=True)]),
-        stripe=scans.stripe,
-        column=scans.column,
-        reach=2.0 * max(across, along) / max(math.cos(scanner.incidence_limit), 0.3),
-        info={
-            "part": part.name,
-            "seed": str(seed),
-            "range_noise_mm": repr(scanner.range_noise),
-            "stripe_pitch_mm": repr(across),
-            "point_pitch_mm": repr(along),
-            **{name: repr(getattr(scanner, name)) for name in scanner.effects},
-        },
-    )
-    if scanner.effects:
-        truth = _with_artefacts(
-            truth, np.concatenate([p.artefact[k] for p, k in zip(passes, keep, strict=True)])
-        )
-    report("truth", 1.0)
-    return scans, truth
+    return scans, passes, keep, across, along
 
 
 def _with_artefacts(truth: Truth, artefact: np.ndarray) -> Truth:

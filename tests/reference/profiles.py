@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from reference.rays import first_hit
 
+from reference.rays import first_hit
 from scanner_sim.part import Part
 from scanner_sim.scanner import StripeScanner
 

@@ -35,14 +35,12 @@ def _measure(height: float, **values: float) -> tuple[StripeScanner, Fan, Peaks,
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     fan = Fan(source, ray @ rotation.T, rotation)
     direct = peaks_of_solid(_ramp().flat(), scanner, fan, np.zeros(3))
-    return scanner, fan, direct, *add_bounces(
-        _ramp().flat(), scanner, fan, np.zeros(3), y, direct
-    )  # type: ignore[return-value]
+    return scanner, fan, direct, *add_bounces(_ramp().flat(), scanner, fan, np.zeros(3), y, direct)  # type: ignore[return-value]
 
 
 def test_a_mirrored_spot_alone_is_triangulated_in_the_laser_plane() -> None:
     height = 3.0
-    scanner, fan, direct, found, mark = _measure(height, incidence_limit=math.radians(50.0))
+    scanner, _, direct, found, mark = _measure(height, incidence_limit=math.radians(50.0))
     assert len(direct.ray) == 0  # the face is beyond the limit
     assert (mark == Artefact.SPIKE).all() and len(found.ray) == 7
     # In the middle row: down to the face, and on by twice 20 degrees from it to the floor.
@@ -74,7 +72,7 @@ def test_the_brighter_of_two_spots_wins() -> None:
 
 
 def test_a_mirrored_spot_beside_the_line_pulls_the_peak() -> None:
-    scanner, fan, direct, found, mark = _measure(0.05, incidence_limit=math.radians(80.0))
+    scanner, _, direct, found, mark = _measure(0.05, incidence_limit=math.radians(80.0))
     assert mark[3] == Artefact.MULTI_BOUNCE
     line = on_detector(scanner, 0.0, direct.length[3])
     second = on_detector(scanner, 0.05 * math.tan(math.radians(40.0)), scanner.stand_off)

@@ -56,7 +56,9 @@ def test_kernels_agree_with_casts(scanner: StripeScanner) -> None:
         x = np.linspace(-half, half, 61)
         fan = _fan(part, scanner, view, x, np.linspace(-half, half, 43))
         middle = part.box.mean(axis=0)
-        plain, kernel = (find(part.flat(), scanner, fan, middle) for find in (peaks, peaks_of_solid))
+        plain, kernel = (
+            find(part.flat(), scanner, fan, middle) for find in (peaks, peaks_of_solid)
+        )
         assert len(plain.ray) > 150
         np.testing.assert_array_equal(kernel.ray, plain.ray)
         np.testing.assert_array_equal(kernel.surface, plain.surface)

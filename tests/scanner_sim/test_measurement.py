@@ -132,7 +132,9 @@ def test_range_noise_of_a_scan_is_what_is_stated() -> None:
     cosine = -np.einsum("ij,ij->i", sight, truth.normal) / np.linalg.norm(sight, axis=1)
     error = np.linalg.norm(_world(scans) - truth.position, axis=1)
     level = np.abs(cosine - np.cos(0.9)) < 0.05
-    assert np.sqrt((error[level] ** 2).mean()) == pytest.approx(0.02 * np.cos(0.9) ** -0.5, rel=0.05)
+    assert np.sqrt((error[level] ** 2).mean()) == pytest.approx(
+        0.02 * np.cos(0.9) ** -0.5, rel=0.05
+    )
 
 
 def test_threshold_and_counts() -> None:

@@ -42,7 +42,9 @@ def test_projection_is_that_of_a_camera_that_looks_at_the_middle() -> None:
     expected = [on_detector(scanner, x, z) for x, z in zip(aside, depth, strict=True)]
     np.testing.assert_allclose(project(scanner, depth, aside), expected, atol=1e-8)
     assert project(scanner, np.array([150.0]), 0.0)[0] == pytest.approx(0.0, abs=1e-9)
-    np.testing.assert_allclose(triangulate(scanner, project(scanner, depth, 0.0)), depth, rtol=1e-13)
+    np.testing.assert_allclose(
+        triangulate(scanner, project(scanner, depth, 0.0)), depth, rtol=1e-13
+    )
     # Depth per pixel at the middle is the pixel over the sine of the angle.
     step = triangulate(scanner, np.array([1e-3]))[0] - triangulate(scanner, np.array([0.0]))[0]
     assert step / 1e-3 == pytest.approx(0.03 / math.sin(math.radians(27.0)), rel=1e-4)
