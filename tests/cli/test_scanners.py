@@ -20,11 +20,8 @@ def test_a_scanner_by_name_and_its_options_over_it() -> None:
         for given in (["--scanner", name], [f"--scanner={name}"]):
             assert parse("simulate", SimulateOptions, [*base, *given]).scanner == probe
     assert set(ScannerName.__args__) == set(SCANNERS)
-    changed = parse(
-        "simulate",
-        SimulateOptions,
-        [*base, "--scanner", "modern", "--speckle", "0", "--lobe-deg", "5"],
-    )
+    over = ["--scanner", "modern", "--speckle", "0", "--lobe-deg", "5"]
+    changed = parse("simulate", SimulateOptions, [*base, *over])
     assert changed.scanner == scanner("modern", speckle=0.0, lobe=np.radians(5.0))
     tested = parse("acceptance", AcceptanceOptions, ["--scanner", "harsh", "--line-width", "0"])
     assert tested.scanner == scanner("harsh", line_width=0.0)
@@ -51,11 +48,11 @@ def test_artefacts_are_recorded_and_scored(octoseg, tmp_path: Path, suffix: str)
     from octoseg_ti import files
 
     path = tmp_path / f"scan{suffix}"
-    arguments = ["--scanner", "harsh", "--points", "8000", "--json"]
+    arguments = ["--scanner", "surveyor-like", "--points", "8000", "--json"]
     outcome = octoseg("simulate", "two-planes", "-o", path, *arguments)
     assert outcome.code == 0, outcome.err
     counts = json.loads(outcome.out)["artefacts"]
-    assert sum(counts.values()) == 8000 and counts["mixed"] > 10
+    assert sum(counts.values()) == 8000 and counts["mixed"] > 5
     truth = files.read_truth(path)
     assert truth is not None and truth.artefact is not None and truth.artefact.dtype == np.uint8
     assert np.count_nonzero(truth.artefact == 1) == counts["mixed"]
