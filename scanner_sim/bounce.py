@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from octoseg_ti.types import Artefact
-from scanner_sim.line_profile import LIFT, Fan, Peaks, visible
+from scanner_sim.line_profile import Fan, Peaks, visible
 from scanner_sim.optics import merging, mirrored_share, project, triangulate
-from scanner_sim.quadric import gradient
-from scanner_sim.raycast import cast
+from scanner_sim.sight import LIFT, trace
 
 if TYPE_CHECKING:
     from scanner_sim.part import FlatPart
@@ -101,13 +100,13 @@ def _alone(
     column = ray % len(fan.ray)
     direction = fan.ray[column]
     origin = fan.source[ray // len(fan.ray)]
-    hits = cast(target, origin, direction, np.full(len(ray), math.inf))
+    hits = trace(target, origin, direction, np.full(len(ray), math.inf))
     position, normal = second.position[chosen], second.normal[chosen]
     surface = second.surface[chosen]
     met = np.flatnonzero(hits.surface >= 0)
     surface[met] = hits.surface[met]
     position[met] = origin[met] + hits.distance[met, None] * direction[met]
-    normal[met] = gradient(target.surfaces, surface[met], position[met]) * hits.side[met, None]
+    normal[met] = hits.normal[met]
     fall = -(direction @ fan.rotation[:, 2])
     length = triangulate(scanner, second.place[chosen]) / fall
     light = second.light[chosen]
@@ -139,11 +138,10 @@ def _mirrored(
     columns = len(fan.ray)
     directions = np.tile(fan.ray, (len(fan.source), 1))
     origins = np.repeat(fan.source, columns, axis=0)
-    hits = cast(target, origins, directions, np.full(len(origins), math.inf))
+    hits = trace(target, origins, directions, np.full(len(origins), math.inf))
     met = np.flatnonzero(hits.surface >= 0)
-    sight, surface = directions[met], hits.surface[met]
+    sight, normal = directions[met], hits.normal[met]
     position = origins[met] + hits.distance[met, None] * sight
-    normal = gradient(target.surfaces, surface, position) * hits.side[met, None]
     cosine = -np.einsum("ij,ij->i", normal, sight)
     share = mirrored_share(scanner, np.clip(cosine, 0.0, 1.0))
     strong = np.flatnonzero(share >= max(_FAINTEST, scanner.threshold))

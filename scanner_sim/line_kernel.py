@@ -15,12 +15,13 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.types import SurfaceKind
-from scanner_sim.line_profile import LIFT, Fan, Peaks
+from scanner_sim.line_profile import Fan, Peaks
 from scanner_sim.optics import merging, pixels_per_slope, shine, sub_rays
 from scanner_sim.part import FlatPart
 from scanner_sim.quadric import gradient
 from scanner_sim.raycast import crossings, nearest_hit
 from scanner_sim.scanner import StripeScanner
+from scanner_sim.sight import LIFT
 
 _PLANE, _CYLINDER = int(SurfaceKind.PLANE), int(SurfaceKind.CYLINDER)
 _CONE, _SPHERE = int(SurfaceKind.CONE), int(SurfaceKind.SPHERE)

@@ -1,6 +1,6 @@
 """What the camera sees of the laser line: one peak a detector row, from the rays over its width.
 
-`peaks` is the plain road, by `cast` and NumPy, for any target; `scanner_sim.line_kernel` does the
+`peaks` is the plain road, ray by ray in NumPy, for any target; `scanner_sim.line_kernel` does the
 same for solids in one kernel. A row's profile is the light of all rays over the line's width that
 laser and camera both reach. The peak is the centroid of the brightest group of spots that touch
 each other on the detector, and is triangulated as if it lay in the middle of the laser plane: so
@@ -15,14 +15,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from scanner_sim.optics import brightness, merging, project, sub_rays, triangulate
-from scanner_sim.quadric import gradient
-from scanner_sim.raycast import cast
+from scanner_sim.sight import hidden, trace
 
 if TYPE_CHECKING:
     from scanner_sim.part import FlatPart
     from scanner_sim.scanner import StripeScanner
-
-LIFT = 1e-6  # shadow rays start this far above the surface [mm]
 
 
 class Fan(NamedTuple):
@@ -86,11 +83,11 @@ def visible(
         cameras: Position of the camera of every ray [mm], world, shape (N, 3).
         heights: Plane z = 0 of the view, as (a point [mm], the unit z axis), shape (2, 3).
     """
-    hits = cast(target, origins, directions, np.full(len(origins), math.inf))
+    hits = trace(target, origins, directions, np.full(len(origins), math.inf))
     found = np.flatnonzero(hits.surface >= 0)
     surface, sight = hits.surface[found], directions[found]
     position = origins[found] + hits.distance[found, None] * sight
-    normal = gradient(target.surfaces, surface, position) * hits.side[found, None]
+    normal = hits.normal[found]
     to_camera = cameras[found] - position
     far = np.linalg.norm(to_camera, axis=1)
     to_camera /= far[:, None]
@@ -100,10 +97,7 @@ def visible(
         height = (position - heights[0]) @ heights[1]
         seen &= np.abs(height) <= scanner.depth_of_field / 2
     open_ = np.flatnonzero(seen)
-    shadow = cast(
-        target, position[open_] + LIFT * normal[open_], to_camera[open_], far[open_], any_hit=True
-    )
-    chosen = open_[shadow.surface < 0]
+    chosen = open_[~hidden(target, position[open_], normal[open_], to_camera[open_], far[open_])]
     return Spots(
         ray=found[chosen], distance=hits.distance[found[chosen]], position=position[chosen],
         normal=normal[chosen], surface=surface[chosen], to_camera=to_camera[chosen],

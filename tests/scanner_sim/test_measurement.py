@@ -183,7 +183,7 @@ def test_same_seed_same_bytes_for_any_number_of_threads() -> None:
 def test_chunks_do_not_change_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     probe = _coarse("harsh")
     whole, _ = simulate(_part(), probe, seed=1)
-    for module in ("line_kernel", "bounce", "simulate"):
+    for module in ("line_kernel", "bounce", "passes"):
         monkeypatch.setattr(sys.modules[f"scanner_sim.{module}"], "_CHUNK", 500)
     monkeypatch.setattr(sys.modules["scanner_sim.effects"], "_BLOCK", 500)
     pieces, _ = simulate(_part(), probe, seed=1)
