@@ -161,8 +161,10 @@ def _pitches(
     across = math.sqrt(area / _TRIAL_RAYS * scanner.aspect)
     if wanted is None:
         return across, across / scanner.aspect
+    # Without its width a line gives as many points, but for some at edges.
+    thin = dataclasses.replace(scanner, line_width=0.0)
     trial = [
-        scan_pass(flat, limits, scanner, view, across, across / scanner.aspect, (0, v))
+        scan_pass(flat, limits, thin, view, across, across / scanner.aspect, (0, v))
         for v, view in enumerate(views)
     ]
     # Points go with the square of the fineness, ends of stripes (lost ones) only linearly.
