@@ -7,16 +7,17 @@ import hashlib
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from octoseg_ti.errors import DataError
 from octoseg_ti.types import Artefact, Scans, Truth
-from scanner_sim import StripeScanner, View, simulate
+from scanner_sim import StripeScanner, View, blocks, simulate
 from scanner_sim.acceptance import scan_of_step
 from scanner_sim.optics import brightness, noise_law
-from scanner_sim.part import Part, box, difference, rod, sphere, union
+from scanner_sim.part import Part, box, difference, half_space, intersection, rod, sphere, union
 from scanner_sim.presets import LIMITS, SCANNERS, scanner
 from scanner_sim.quadric import distance
 from scanner_sim.scanner import EFFECTS
@@ -100,6 +101,39 @@ def test_mixed_points_lie_within_the_line_width_of_a_step() -> None:
     z = _world(scans)[:, 2]
     assert np.minimum(np.abs(z), np.abs(z - 5.0)).max() < 1e-9
     assert set(np.unique(_world(scans)[:, 0] > 0)) == {False, True}
+
+
+def test_mirror_images_are_spikes_off_the_part_and_in_no_patch() -> None:
+    # A polished face of 70 degrees beside a floor, too steep to be measured itself.
+    tilt = np.radians(70.0)
+    face = half_space((0, 0, 0), (-np.sin(tilt), 0.0, np.cos(tilt)))
+    ramp = union(box((-12, -5, -2), (4, 5, 0)), intersection(face, box((-1, -5, -2), (4, 5, 8))))
+    probe = _coarse("harsh", incidence_limit=np.radians(50.0), specular=0.4, views=(View(),))
+    scans, truth = simulate(ramp, probe, seed=1)
+    assert truth.artefact is not None and truth.surface is not None
+    spikes = truth.artefact == Artefact.SPIKE
+    assert spikes.sum() > 100
+    assert (truth.patch[spikes] == -1).all() and len(np.unique(truth.surface[spikes])) == 1
+    error, limit = _budget(probe, scans, truth)
+    assert (np.abs(error[spikes]) > 0.5 * limit[spikes]).mean() > 0.9
+    without, matte = simulate(ramp, dataclasses.replace(probe, specular=0.0), seed=1)
+    assert matte.artefact is not None and not (matte.artefact == Artefact.SPIKE).any()
+    assert len(without) < len(scans)
+
+
+def test_the_recordings_are_still_what_the_default_scanner_measures() -> None:
+    from octoseg_ti import files
+
+    path = Path(__file__).resolve().parents[2] / "recordings" / "two-planes.mcap"
+    recorded, (scans, truth) = files.read_truth(path), simulate(blocks.two_planes(), seed=7)
+    assert recorded is not None and recorded.artefact is None
+    for field in dataclasses.fields(Truth):
+        if field.name != "info":
+            found, expected = getattr(truth, field.name), getattr(recorded, field.name)
+            assert (found is None) == (expected is None), field.name
+            if found is not None:
+                np.testing.assert_allclose(found, expected, atol=1e-9, err_msg=field.name)
+    np.testing.assert_allclose(files.read(path).points, _world(scans), atol=1e-4)
 
 
 def test_effects_that_are_off_leave_the_rest_as_it_is() -> None:
