@@ -165,6 +165,7 @@ def _follow_rays(
     boxes_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
+    faces_in: F64Rows,
     sources_in: F64Rows,
     rays_in: F64Rows,
     line_in: F64Rows,
@@ -187,7 +188,9 @@ def _follow_rays(
             origin = source + line_in[k // 4, 0] * optics.across
             hit = vec3(_FAR, -1.0, 0.0)
             if not known:
-                hit = nearest_hit(code_in, boxes_in, kinds_in, data_in, origin, ray, _FAR, 0)
+                hit = nearest_hit(
+                    code_in, boxes_in, kinds_in, data_in, faces_in, origin, ray, _FAR, 0
+                )  # fmt: skip
             elif lit:
                 hit = vec3(0.0, spots_inout[i, middle + 1], spots_inout[i, middle + 2])
                 s = ti.i32(hit[1])
@@ -211,6 +214,7 @@ def _look_back(
     boxes_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
+    faces_in: F64Rows,
     sources_in: F64Rows,
     rays_in: F64Rows,
     line_in: F64Rows,
@@ -231,7 +235,7 @@ def _look_back(
                 far = back.norm()
                 start = place + LIFT * spots_inout[i, k + 2] * normal
                 hit = nearest_hit(
-                    code_in, boxes_in, kinds_in, data_in, start, back / far, far, 1
+                    code_in, boxes_in, kinds_in, data_in, faces_in, start, back / far, far, 1
                 )  # fmt: skip
                 bright = -spots_inout[i, k + 3]
                 spots_inout[i, k + 3] = 0.0 if hit[1] > -0.5 else bright
@@ -308,8 +312,12 @@ def peaks_of_solid(target: FlatPart, scanner: StripeScanner, fan: Fan, middle: n
     line = runtime.upload(np.column_stack([offsets, shares]))
     optics = _optics(scanner, fan.rotation)
     boxes = target.boxes if len(target.boxes) else np.zeros((1, 6))
-    part = [runtime.upload(a) for a in (target.code, boxes, target.surfaces.kind,
-                                        target.surfaces.data, fan.ray)]  # fmt: skip
+    faces = target.surface_boxes.reshape(-1, 6)
+    part = [
+        runtime.upload(np.ascontiguousarray(a))
+        for a in (target.code, boxes, target.surfaces.kind, target.surfaces.data, faces)
+    ]
+    ray = runtime.upload(fan.ray)
     columns = len(fan.ray)
     step = max(_CHUNK // columns, 1)
     pieces = []
@@ -319,7 +327,7 @@ def peaks_of_solid(target: FlatPart, scanner: StripeScanner, fan: Fan, middle: n
         value = runtime.empty((rows, 4), np.float64)
         hit = runtime.empty((rows, 3), np.int32)
         spots = runtime.empty((rows, 4 * len(offsets)), np.float64)
-        rays = (*part[:4], runtime.upload(source), part[4], line, spots)
+        rays = (*part, runtime.upload(source), ray, line, spots)
         # The outer rays and the middle one first; the others follow them where they agree.
         for first, stop in ((0, min(3, len(offsets))), (3, len(offsets))):
             if first < stop:
@@ -327,7 +335,7 @@ def peaks_of_solid(target: FlatPart, scanner: StripeScanner, fan: Fan, middle: n
                 _look_back(optics, first, stop, *rays)
         place = runtime.empty((rows, len(offsets)), np.float64)
         order = runtime.empty((rows, len(offsets)), np.int32)
-        _find_peaks(optics, part[4], line, spots, place, order, value, hit)
+        _find_peaks(optics, ray, line, spots, place, order, value, hit)
         runtime.sync()
         pieces.append(_gather(target, fan, source, offsets, start, value, hit))
     return Peaks(*(np.concatenate(column) for column in zip(*pieces, strict=True)))

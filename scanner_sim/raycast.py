@@ -23,6 +23,7 @@ _SKIP_FALSE, _SKIP_TRUE = int(Op.SKIP_FALSE), int(Op.SKIP_TRUE)
 _FAR = 1e30
 _NEAR = 1e-9  # a hit closer to the origin of its ray than this is the origin itself [mm]
 _HALVINGS = 48
+_SLACK = 1e-5  # a hit may be this far outside of the box around the faces of its surface [mm]
 
 
 class Hits(NamedTuple):
@@ -67,8 +68,9 @@ def cast(
     sides = runtime.empty(count, np.int32)
     _cast_rays(
         runtime.upload(part.code), _boxes(part), runtime.upload(part.surfaces.kind),
-        runtime.upload(part.surfaces.data), _rows(origins), _rows(directions),
-        runtime.upload(limits), int(any_hit), distances, surfaces, sides,
+        runtime.upload(part.surfaces.data), _rows(part.surface_boxes.reshape(-1, 6)),
+        _rows(origins), _rows(directions), runtime.upload(limits), int(any_hit),
+        distances, surfaces, sides,
     )  # fmt: skip
     runtime.sync()
     found = runtime.download(surfaces)[:count]
@@ -324,8 +326,19 @@ def _meets_box(boxes: ti.template(), b, origin, direction, reach):
 
 
 @ti.func
+def _in_box(boxes: ti.template(), b, p):
+    """Say whether a place is in box b, or as good as in it."""
+    inside = True
+    for k in ti.static(range(3)):
+        if p[k] < boxes[b, k] - _SLACK or p[k] > boxes[b, k + 3] + _SLACK:
+            inside = False
+    return inside
+
+
+@ti.func
 def nearest_hit(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
-                data: ti.template(), origin, direction, reach, any_hit):  # fmt: skip
+                data: ti.template(), faces: ti.template(),
+                origin, direction, reach, any_hit):  # fmt: skip
     """Return (distance, surface or -1, side) of a ray's nearest hit, or of any within reach.
 
     The part's program is walked once; every crossing that is nearer than the best hit is tested.
@@ -346,8 +359,10 @@ def nearest_hit(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
             found = crossings(kinds[arg], data, arg, origin, direction)
             for k in range(4):
                 t = found[k]
-                if _NEAR < t < best:
-                    bits = _solid_if(code, boxes, kinds, data, origin + t * direction, arg)
+                p = origin + t * direction
+                # Whoever is outside of this box need not be asked about the whole part.
+                if _NEAR < t < best and _in_box(faces, arg, p):
+                    bits = _solid_if(code, boxes, kinds, data, p, arg)
                     if bits == 1 or bits == 2:
                         best = t
                         surface = arg
@@ -362,6 +377,7 @@ def _cast_rays(
     boxes_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
+    faces_in: F64Rows,
     origins_in: F64Rows,
     directions_in: F64Rows,
     reach_in: F64Array,
@@ -374,7 +390,7 @@ def _cast_rays(
     """Follow every ray to its nearest hit."""
     for i in range(origins_in.shape[0]):
         hit = nearest_hit(
-            code_in, boxes_in, kinds_in, data_in, _vector(origins_in, i, 0),
+            code_in, boxes_in, kinds_in, data_in, faces_in, _vector(origins_in, i, 0),
             _vector(directions_in, i, 0), reach_in[i], any_hit,
         )  # fmt: skip
         distances_out[i] = hit[0]
