@@ -13,11 +13,12 @@ if TYPE_CHECKING:
     from octoseg_ti.files import read, read_segmentation, read_truth, write
     from octoseg_ti.params import Params, paper
     from octoseg_ti.pipeline import segment
-    from octoseg_ti.types import EdgeClass, Scans, Segmentation, SurfaceKind, Truth
+    from octoseg_ti.types import Artefact, EdgeClass, Scans, Segmentation, SurfaceKind, Truth
 
 __version__ = "0.1.0"
 
 _HOME = {
+    "Artefact": "types",
     "DataError": "errors",
     "EdgeClass": "types",
     "MissingPackageError": "errors",
@@ -37,6 +38,7 @@ _HOME = {
 }
 
 __all__ = [
+    "Artefact",
     "DataError",
     "EdgeClass",
     "MissingPackageError",

@@ -42,6 +42,19 @@ class EdgeClass(IntEnum):
     """A joint where the normal is continuous and the curvature is not."""
 
 
+class Artefact(IntEnum):
+    """What is wrong with a measured point, beyond the noise that the scanner states."""
+
+    CLEAN = 0
+    MIXED = 1
+    """An edge of the part or of a shadow cuts the laser line: the peak lies between two surfaces,
+    or on one side of the line."""
+    SPIKE = 2
+    """The peak is a mirror image: the laser was reflected and hit the part a second time."""
+    MULTI_BOUNCE = 3
+    """Mirrored light beside the line pulls the peak, as in a corner."""
+
+
 class StopReason(IntEnum):
     """Why a cell was not split further."""
 
@@ -100,8 +113,9 @@ class Truth:
     """
 
     patch: np.ndarray
-    """Patch of every point, shape (N,), i32, 0..K-1 by size; -1 = no patch (a fillet strip, an
-    artefact, not labelled). A patch is a connected visible piece of one surface."""
+    """Patch of every point, shape (N,), i32, 0..K-1 by size; -1 = no patch (a fillet strip, a
+    mirror image, not labelled). A patch is a connected visible piece of one surface. A mixed point
+    has the patch of the surface that most of its light came from."""
     surface: np.ndarray | None = None
     """Surface (face of the construction) of every point, shape (N,), i32."""
     kind: np.ndarray | None = None
@@ -116,6 +130,9 @@ class Truth:
     """`EdgeClass` of that nearest edge, shape (N,), u8."""
     T_world_view: np.ndarray | None = None
     """True pose of every view: maps view to world, shape (V, 4, 4), f64."""
+    artefact: np.ndarray | None = None
+    """`Artefact` of every point, shape (N,), u8; None when the measurement is not known to have
+    any."""
     info: dict[str, str] = field(default_factory=dict)
     """How the truth came about: part, seed, noise."""
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from scanner_sim import blocks
     from scanner_sim.part import Part, box, cone, cylinder, half_space, rod, sphere, torus
     from scanner_sim.scanner import StripeScanner, View
-    from scanner_sim.simulate import ScanStream, scan_views, simulate
+    from scanner_sim.simulate import ScanStream, measure, scan_views, simulate
     from scanner_sim.solid_options import SolidOptions
     from scanner_sim.solids import read_part
     from scanner_sim.views import ProbeHead, parse_views, plan_views
@@ -37,6 +37,7 @@ _HOME = {
     "cone": "part",
     "cylinder": "part",
     "half_space": "part",
+    "measure": "simulate",
     "parse_views": "views",
     "plan_views": "views",
     "read_part": "solids",
@@ -59,6 +60,7 @@ __all__ = [
     "cone",
     "cylinder",
     "half_space",
+    "measure",
     "parse_views",
     "plan_views",
     "read_part",

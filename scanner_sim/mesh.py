@@ -81,6 +81,15 @@ class MeshPart:
         far = 1.5 * self.size
         return far if far > StripeScanner().stand_off else None
 
+    @property
+    def lift(self) -> float:
+        """How far above the surface rays that leave it start [mm].
+
+        The triangles of a hollow form lie above it, by the deflection at most; the rays begin a
+        little more than that above the surface.
+        """
+        return 2.0 * self.deflection + _LIFT * self.size
+
     def trace(self, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> TargetHits:
         """Follow rays to the first surface; exact where the surface has an exact form."""
         # The triangle may lie a little behind the exact form, which is then within reach.
@@ -148,14 +157,9 @@ class MeshPart:
     def hidden(
         self, positions: np.ndarray, normals: np.ndarray, directions: np.ndarray, reach: np.ndarray
     ) -> np.ndarray:
-        """Return whether something stands in the way of points that `trace` has found.
-
-        The triangles of a hollow form lie above it, by the deflection at most. So the way begins a
-        little more than that above the surface.
-        """
-        lift = 2.0 * self.deflection + _LIFT * self.size
+        """Return whether something stands in the way of points that `trace` has found."""
         found = cast_triangles(
-            self.tree, positions + lift * normals, directions, reach, any_hit=True
+            self.tree, positions + self.lift * normals, directions, reach, any_hit=True
         )[1]
         hidden: np.ndarray = found >= 0
         return hidden

@@ -242,7 +242,7 @@ def _quartic(c2, c1, c0, limit):
 
 
 @ti.func
-def _crossings(kind, data: ti.template(), s, origin, direction):
+def crossings(kind, data: ti.template(), s, origin, direction):
     """Return where a ray crosses surface s: up to four distances, unused ones far away."""
     found = ti.Vector([_FAR, _FAR, _FAR, _FAR])
     axis = _vector(data, s, 3)
@@ -335,6 +335,41 @@ def _in_box(boxes: ti.template(), b, p):
     return inside
 
 
+@ti.func
+def nearest_hit(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
+                data: ti.template(), faces: ti.template(),
+                origin, direction, reach, any_hit):  # fmt: skip
+    """Return (distance, surface or -1, side) of a ray's nearest hit, or of any within reach.
+
+    The part's program is walked once; every crossing that is nearer than the best hit is tested.
+    """
+    best = reach
+    surface = -1
+    side = 0
+    pc = 0
+    while pc < code.shape[0] and not (any_hit == 1 and surface >= 0):
+        op = code[pc, 0]
+        arg = code[pc, 1]
+        jump = code[pc, 2]
+        pc += 1
+        if op == _BOX:
+            if not _meets_box(boxes, arg, origin, direction, best):
+                pc = jump
+        elif op == _LEAF:
+            found = crossings(kinds[arg], data, arg, origin, direction)
+            for k in range(4):
+                t = found[k]
+                p = origin + t * direction
+                # Whoever is outside of this box need not be asked about the whole part.
+                if _NEAR < t < best and _in_box(faces, arg, p):
+                    bits = _solid_if(code, boxes, kinds, data, p, arg)
+                    if bits == 1 or bits == 2:
+                        best = t
+                        surface = arg
+                        side = 1 if bits == 2 else -1
+    return ti.Vector([best, ti.f64(surface), ti.f64(side)])
+
+
 @ti.kernel
 def _cast_rays(
     # In:
@@ -352,37 +387,15 @@ def _cast_rays(
     surfaces_out: I32Array,
     sides_out: I32Array,
 ):
-    """Walk the part's program once a ray; test every crossing that is nearer than the best hit."""
+    """Follow every ray to its nearest hit."""
     for i in range(origins_in.shape[0]):
-        origin = _vector(origins_in, i, 0)
-        direction = _vector(directions_in, i, 0)
-        best = reach_in[i]
-        surface = -1
-        side = 0
-        pc = 0
-        while pc < code_in.shape[0] and not (any_hit == 1 and surface >= 0):
-            op = code_in[pc, 0]
-            arg = code_in[pc, 1]
-            jump = code_in[pc, 2]
-            pc += 1
-            if op == _BOX:
-                if not _meets_box(boxes_in, arg, origin, direction, best):
-                    pc = jump
-            elif op == _LEAF:
-                crossings = _crossings(kinds_in[arg], data_in, arg, origin, direction)
-                for k in range(4):
-                    t = crossings[k]
-                    p = origin + t * direction
-                    # Whoever is outside of this box need not be asked about the whole part.
-                    if _NEAR < t < best and _in_box(faces_in, arg, p):
-                        bits = _solid_if(code_in, boxes_in, kinds_in, data_in, p, arg)
-                        if bits == 1 or bits == 2:
-                            best = t
-                            surface = arg
-                            side = 1 if bits == 2 else -1
-        distances_out[i] = best
-        surfaces_out[i] = surface
-        sides_out[i] = side
+        hit = nearest_hit(
+            code_in, boxes_in, kinds_in, data_in, faces_in, _vector(origins_in, i, 0),
+            _vector(directions_in, i, 0), reach_in[i], any_hit,
+        )  # fmt: skip
+        distances_out[i] = hit[0]
+        surfaces_out[i] = ti.i32(hit[1])
+        sides_out[i] = ti.i32(hit[2])
 
 
 @ti.kernel

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from octoseg_ti.errors import DataError
-from octoseg_ti.types import Scans, Truth
+from octoseg_ti.types import NONE, Artefact, Scans, Truth
+from scanner_sim.passes import Pass, arrivals, extent, measured, scan_pass
 from scanner_sim.poses import as_recorded, recorded_poses
 from scanner_sim.scanner import DEFAULT_VIEWS, StripeScanner, View
 from scanner_sim.target import as_target, far_enough
@@ -28,26 +29,10 @@ _SURPLUS = 1.01  # aim this far above the wanted number; what is too much is thi
 _ATTEMPTS = 6
 
 
-class _Pass(NamedTuple):
-    """The points of one view, in scan order; frame of the view unless it says world."""
-
-    stripe: np.ndarray
-    column: np.ndarray
-    source: np.ndarray
-    """Position of the laser at every stripe [mm], world, shape (stripes, 3)."""
-    position: np.ndarray
-    """True position [mm], world."""
-    normal: np.ndarray
-    """True normal, world."""
-    surface: np.ndarray
-    sight: np.ndarray
-    """Direction of the laser's ray, world, unit."""
-
-
 class _Arrived(NamedTuple):
     """A pass, which of its points arrive, and the random numbers of its view from here on."""
 
-    scan: _Pass
+    scan: Pass
     keep: np.ndarray
     generator: np.random.Generator
 
@@ -59,6 +44,7 @@ class _View(NamedTuple):
     position: np.ndarray
     normal: np.ndarray
     surface: np.ndarray
+    artefact: np.ndarray
 
 
 def simulate(
@@ -70,9 +56,16 @@ def simulate(
 ) -> tuple[Scans, Truth]:
     """Scan a part, and say what is true about every point.
 
-    A point exists where the laser's ray first meets the part, if the camera sees that place too
-    (both shadows), at an angle that both bear. The same arguments give the same arrays, on any
-    number of threads.
+    A point exists where the laser's line first meets the part, if the camera sees that place too
+    (both shadows), at an angle that both bear. A line with a width and the other effects of
+    `StripeScanner` are measured as a probe does: by the peak of the light in every row of its
+    detector. The same arguments give the same arrays, on any number of threads.
+
+    Artefacts: the true place of a mixed point is that of the line's middle ray, or of its brightest
+    one where the middle one is not in the peak; a spike's is where the laser of its row meets the
+    part, and it is in no patch. A point is clean when the peak, noise aside, lies within half the
+    stated noise (`scanner_sim.optics.noise_law`) or a micrometre of its true surface, along the
+    line of sight.
 
     Args:
         part: The solid, in mm.
@@ -91,6 +84,15 @@ def simulate(
     pieces = list(stream)
     assert stream.truth is not None
     return joined(pieces), stream.truth
+
+
+def measure(part: Part | Target, scanner: StripeScanner, *, seed: int = 0) -> Scans:
+    """Return the scans of `simulate` alone, for who does without the truth: several times faster.
+
+    Raises:
+        DataError: As `simulate`.
+    """
+    return joined(list(scan_views(part, scanner, seed=seed, truth=False)))
 
 
 class ScanStream:
@@ -167,10 +169,10 @@ def scan_views(
 
     def passes(across: float, along: float) -> Iterator[_Arrived]:
         for v, seq in zip(range(len(views)), _children(seed, len(views)), strict=False):
-            scan = _scan(target, scanner, views[v], across, along)
+            scan = scan_pass(target, scanner, views[v], across, along, (seed, v))
             generator = np.random.default_rng(seq)
             report("scan", (v + 1) / len(views))
-            yield _Arrived(scan, _losses(scan, scanner, generator), generator)
+            yield _Arrived(scan, arrivals(scan, scanner, generator, (seed, v)), generator)
 
     arrived: Iterable[_Arrived] = passes(across, along)
     if exact is not None:
@@ -202,12 +204,15 @@ def scan_views(
                 "range_noise_mm": repr(scanner.range_noise),
                 "stripe_pitch_mm": repr(across),
                 "point_pitch_mm": repr(along),
+                **{name: repr(getattr(scanner, name)) for name in scanner.effects},
             },
         )
+        if scanner.effects:
+            answer = _with_artefacts(answer, np.concatenate([one.artefact for one in known]))
         report("truth", 1.0)
         return replace(answer, T_world_view=_true_poses(target, views))
 
-    pieces = _assemble(arrived, scanner, views, target, seed)
+    pieces = _assemble(arrived, scanner, views, target, seed, along)
     return ScanStream(pieces, finish if truth else None, at_once=exact is None)
 
 
@@ -238,6 +243,17 @@ def _true_poses(target: Target, views: tuple[View, ...]) -> np.ndarray:
     return poses
 
 
+def _with_artefacts(truth: Truth, artefact: np.ndarray) -> Truth:
+    """Return the truth with artefacts; spikes leave their patches, which are ordered anew."""
+    patch = np.where(artefact == Artefact.SPIKE, NONE, truth.patch).astype(np.int32)
+    size = np.bincount(patch[patch >= 0], minlength=truth.patch_count)
+    rank = np.full(len(size) + 1, NONE, np.int32)
+    order = np.argsort(-size, kind="stable")
+    order = order[size[order] > 0]
+    rank[order] = np.arange(len(order))
+    return replace(truth, patch=rank[patch], artefact=artefact)
+
+
 def _pitches(
     target: Target, scanner: StripeScanner, views: tuple[View, ...], wanted: int | None
 ) -> tuple[float, float]:
@@ -251,113 +267,23 @@ def _pitches(
         return across, along
     area = 0.0
     for view in views:
-        low, high = _extent(target.box, scanner, view)
+        low, high = extent(target.box, scanner, view)
         area += float(np.prod((high - low)[:2]))
     across = math.sqrt(area / _TRIAL_RAYS * scanner.aspect)
     if wanted is None:
         return across, across / scanner.aspect
-    trial = [_scan(target, scanner, view, across, across / scanner.aspect) for view in views]
+    # Without its width a line gives as many points, but for some at edges.
+    thin = replace(scanner, line_width=0.0)
+    trial = [
+        scan_pass(target, thin, view, across, across / scanner.aspect, (0, v))
+        for v, view in enumerate(views)
+    ]
     # Points go with the square of the fineness, ends of stripes (lost ones) only linearly.
     points = float(sum(len(scan.stripe) for scan in trial))
     points *= (1.0 - scanner.dropout) * (1.0 - scanner.lost_stripes)
     ends = sum(len(np.unique(scan.stripe)) for scan in trial) * scanner.lost_ends
     across /= (ends + math.sqrt(ends**2 + points * wanted * _SURPLUS)) / max(points, 1.0)
     return across, across / scanner.aspect
-
-
-def _extent(
-    limits: np.ndarray, scanner: StripeScanner, view: View
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return lowest and highest stage and ray position that meet the part's box, shape (3,) each.
-
-    x = stage, y = where the ray meets the plane z = 0, seen from the laser, z = height; all in the
-    frame of the view [mm].
-    """
-    middle = limits.mean(axis=0)
-    corners = np.array([[limits[i, 0], limits[j, 1], limits[k, 2]]
-                        for i in (0, 1) for j in (0, 1) for k in (0, 1)])  # fmt: skip
-    local = (corners - middle) @ view.rotation() - (0.0, view.offset, 0.0)
-    if local[:, 2].max() >= scanner.stand_off:
-        raise DataError(
-            f"the part reaches the probe: its box ends {local[:, 2].max():.0f} mm above its "
-            f"middle, the laser stands at {scanner.stand_off:.0f} mm",
-            hint="raise stand_off",
-        )
-    local[:, 1] *= scanner.stand_off / (scanner.stand_off - local[:, 2])
-    low, high = local.min(axis=0), local.max(axis=0)
-    if scanner.field_of_view is not None:
-        half = scanner.field_of_view / 2
-        low[1], high[1] = max(low[1], -half), min(high[1], half)
-    return low, high
-
-
-def _scan(
-    target: Target,
-    scanner: StripeScanner,
-    view: View,
-    across: float,
-    along: float,
-) -> _Pass:
-    """Return all points that laser and camera both see, in scan order, without noise and losses."""
-    rotation = view.rotation()
-    middle = target.box.mean(axis=0)
-    low, high = _extent(target.box, scanner, view)
-    x = _spread(low[0], high[0], across)
-    y = _spread(low[1], high[1], along)
-    stripes, columns = len(x), len(y)
-    source = np.stack(
-        [x, np.full(stripes, view.offset), np.full(stripes, scanner.stand_off)], axis=1
-    )
-    ray = np.stack([np.zeros(columns), y, np.full(columns, -scanner.stand_off)], axis=1)
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    source_world = source @ rotation.T + middle
-    ray_world = ray @ rotation.T
-    origins = np.repeat(source_world, columns, axis=0)
-    directions = np.tile(ray_world, (stripes, 1))
-    hits = target.trace(origins, directions, np.full(len(origins), math.inf))
-    found = np.flatnonzero(hits.surface >= 0)
-    surface = hits.surface[found]
-    sight = directions[found]
-    position = origins[found] + hits.distance[found, None] * sight
-    normal = hits.normal[found]
-    stripe, column = found // columns, found % columns
-    camera = (source[stripe] + scanner.camera) @ rotation.T + middle
-    to_camera = camera - position
-    far = np.linalg.norm(to_camera, axis=1)
-    to_camera /= far[:, None]
-    seen = -np.einsum("ij,ij->i", normal, sight) >= math.cos(scanner.incidence_limit)
-    seen &= np.einsum("ij,ij->i", normal, to_camera) >= math.cos(scanner.camera_limit)
-    if scanner.depth_of_field is not None:
-        height = (position - middle) @ rotation[:, 2]
-        seen &= np.abs(height) <= scanner.depth_of_field / 2
-    open_ = np.flatnonzero(seen)
-    shadow = target.hidden(position[open_], normal[open_], to_camera[open_], far[open_])
-    chosen = open_[~shadow]
-    return _Pass(
-        stripe=stripe[chosen].astype(np.int32), column=column[chosen].astype(np.int32),
-        source=source_world, position=position[chosen], normal=normal[chosen],
-        surface=surface[chosen], sight=sight[chosen],
-    )  # fmt: skip
-
-
-def _spread(low: float, high: float, pitch: float) -> np.ndarray:
-    """Return places at a pitch, amid a range: no ray then runs along a side of the part."""
-    count = max(int((high - low) / pitch), 1)
-    return 0.5 * (low + high) + pitch * (np.arange(count) - 0.5 * (count - 1))
-
-
-def _losses(scan: _Pass, scanner: StripeScanner, generator: np.random.Generator) -> np.ndarray:
-    """Return which points arrive: without lost stripes, ragged ends and single losses."""
-    count, stripes = len(scan.stripe), len(scan.source)
-    lines = generator.random(stripes) >= scanner.lost_stripes
-    trim = generator.poisson(scanner.lost_ends, (2, stripes))
-    single = generator.random(count) >= scanner.dropout
-    starts = np.searchsorted(scan.stripe, np.arange(stripes))
-    ends = np.searchsorted(scan.stripe, np.arange(stripes), side="right")
-    place = np.arange(count)
-    keep = place - starts[scan.stripe] >= trim[0][scan.stripe]
-    keep &= ends[scan.stripe] - 1 - place >= trim[1][scan.stripe]
-    return keep & lines[scan.stripe] & single
 
 
 def _thin(keep: list[np.ndarray], wanted: int, generator: np.random.Generator) -> None:
@@ -379,7 +305,7 @@ def _thin(keep: list[np.ndarray], wanted: int, generator: np.random.Generator) -
 
 def _assemble(
     arrived: Iterable[_Arrived], scanner: StripeScanner, views: tuple[View, ...], target: Target,
-    seed: int,
+    seed: int, along: float,
 ) -> Iterator[_View]:  # fmt: skip
     """Give the scans of view after view: noise along the line of sight, frames of the views."""
     true = _true_poses(target, views)
@@ -388,9 +314,12 @@ def _assemble(
     period = 1e9 / scanner.stripe_rate
     first = count = 0
     for v, (scan, chosen, generator) in enumerate(arrived):
-        noise = generator.normal(0.0, scanner.range_noise, int(chosen.sum()))
         position = scan.position[chosen]
-        world = position + noise[:, None] * scan.sight[chosen]
+        if scanner.effects:
+            world = measured(scan, chosen, scanner, (seed, v), along)
+        else:
+            noise = generator.normal(0.0, scanner.range_noise, int(chosen.sum()))
+            world = position + noise[:, None] * scan.sight[chosen]
         stripe = scan.stripe[chosen] + first
         columns = int(scan.column.max(initial=0)) + 1
         # The camera reads its rows one after the other within the period of a stripe.
@@ -411,7 +340,9 @@ def _assemble(
             frame="view",
             name=target.name,
         )
-        yield _View(scans, position, scan.normal[chosen], scan.surface[chosen])
+        yield _View(
+            scans, position, scan.normal[chosen], scan.surface[chosen], scan.artefact[chosen]
+        )
     if count == 0:
         raise DataError(
             f"the scanner sees nothing of part {target.name or 'without a name'!r}",

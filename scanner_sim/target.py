@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from octoseg_ti.types import Truth
     from scanner_sim.scanner import View
 
-_LIFT = 1e-6  # shadow rays start this far above the surface [mm]
+LIFT = 1e-6  # shadow rays start this far above the surface [mm]
 
 
 class TargetHits(NamedTuple):
@@ -52,6 +52,10 @@ class Target(Protocol):
     @property
     def stand_off(self) -> float | None:
         """Distance from which to scan it [mm] where the scanner's is left at its default."""
+
+    @property
+    def lift(self) -> float:
+        """How far above the surface rays that leave it start [mm]."""
 
     @property
     def info(self) -> dict[str, str]:
@@ -102,6 +106,7 @@ class CsgTarget:
         self.name, self.box, self.views = part.name, part.box, part.views
         self.nominal_points = part.nominal_points
         self.stand_off: float | None = None
+        self.lift = LIFT
         self.info: dict[str, str] = {}
 
     def trace(self, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> TargetHits:
@@ -118,7 +123,7 @@ class CsgTarget:
         self, positions: np.ndarray, normals: np.ndarray, directions: np.ndarray, reach: np.ndarray
     ) -> np.ndarray:
         """Return whether something stands in the way of points of the solid."""
-        lifted = positions + _LIFT * normals
+        lifted = positions + LIFT * normals
         hidden: np.ndarray = cast(self.flat, lifted, directions, reach, any_hit=True).surface >= 0
         return hidden
 

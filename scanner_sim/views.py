@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from scanner_sim.target import Target
 
 _SAMPLES = 1500
+_MOST_PASSES = 1000  # side by side, for one orientation
 _SEED = 20020
 _HELD = 0.005  # least share of the normals along every direction of motion
 _COARSE = 2  # the planner tries every second index in tilt, and every second in azimuth
@@ -231,6 +232,12 @@ def _side_by_side(
     if width <= 0.0 or span <= width:
         return (view,)
     passes = math.ceil((span - overlap * width) / ((1.0 - overlap) * width))
+    if passes > _MOST_PASSES:
+        raise DataError(
+            f"a field of view of {scanner.field_of_view:g} mm is too narrow for a part that is "
+            f"{span:.3g} mm wide: {passes} passes side by side",
+            hint="raise field_of_view",
+        )
     step = (span - width) / (passes - 1)
     middle = (local[:, 1].max() + local[:, 1].min()) / 2.0
     return tuple(

@@ -25,6 +25,7 @@ VERBS = {
     "info": ("inspect", "say what is in a file"),
     "check": ("inspect", "verify a file"),
     "convert": ("convert", "translate a file into another format"),
+    "acceptance": ("acceptance", "measure a simulated scanner on a ball, a plane and a step"),
     "paper": ("paper", "redo the examples of the paper that the method comes from"),
 }
 """Verb -> (module in this package, one line of help). A module has OPTIONS and run_<verb>."""

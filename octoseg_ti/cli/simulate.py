@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -12,6 +12,7 @@ from octoseg_ti.cli import UsageError, suggest
 from octoseg_ti.cli.options import Machine, check_inputs, check_outputs
 from octoseg_ti.cli.output import Report, out, out_json, progress, size_of
 from octoseg_ti.errors import DataError
+from scanner_sim.presets import SCANNERS
 from scanner_sim.scanner import StripeScanner, View
 from scanner_sim.solid_options import SUFFIXES as SOLIDS
 from scanner_sim.solid_options import SolidOptions
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from octoseg_ti.types import Scans, Truth
     from scanner_sim import ScanStream
 
+ScannerName = Literal["default", "ideal", "surveyor-like", "modern", "harsh"]
 SUFFIXES = (".mcap", ".npz", ".ply", ".rrd")
 
 
@@ -33,6 +35,8 @@ class SimulateOptions:
 
     The recording holds the stripes, the poses of the scanner and, for every point, its patch,
     surface, true position and normal, and the nearest true edge. The same seed gives the same file.
+    --scanner names a whole scanner; every option below changes it: --scanner surveyor-like
+    --speckle 0.
     """
 
     part: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PART")]
@@ -41,6 +45,8 @@ class SimulateOptions:
     .step .stp .stl .obj .ply"""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")]
     """File to write, by suffix: .mcap .npz .ply .rrd"""
+    preset: Annotated[ScannerName, tyro.conf.arg(aliases=["--scanner"])] = "default"
+    """Whole scanner by name, whose values the options of the scanner then change."""
     seed: int = 7
     """Seed of noise and dropouts."""
     views: str | None = None
@@ -60,6 +66,21 @@ class SimulateOptions:
     solid: tyro.conf.OmitArgPrefixes[SolidOptions] = field(default_factory=SolidOptions)
     machine: tyro.conf.OmitArgPrefixes[Machine] = field(default_factory=Machine)
 
+    @staticmethod
+    def defaults(arguments: list[str]) -> dict[str, Any]:
+        """Return the scanner that the arguments name as default."""
+        return {"scanner": scanner_in(arguments)}
+
+
+def scanner_in(arguments: list[str]) -> StripeScanner:
+    """Return the scanner that --scanner names; the parser refuses an unknown one later."""
+    name = "default"
+    for k, argument in enumerate(arguments):
+        key, found, value = argument.partition("=")
+        if key in ("--scanner", "--preset"):
+            name = value if found else next(iter(arguments[k + 1 : k + 2]), name)
+    return SCANNERS.get(name, SCANNERS["default"])
+
 
 OPTIONS = {"simulate": SimulateOptions}
 
@@ -74,6 +95,8 @@ def run_simulate(options: SimulateOptions) -> int:
         views = chosen_views(part, scanner, options.views, options.overlap)
         scanner = replace(scanner, views=views)
     run = {"command": "octoseg simulate", "part": options.part, "seed": str(options.seed)}
+    if options.preset != "default":
+        run["scanner"] = options.preset
     from scanner_sim import scan_views
 
     with progress("simulate", quiet=options.quiet) as report:
@@ -127,8 +150,12 @@ def _write_whole(
 
 def _truth_figures(truth: Truth | None) -> dict[str, Any]:
     if truth is None:
-        return {"patches": None, "truth": None}
-    return {"patches": truth.patch_count, "truth": truth.info}
+        return {"patches": None, "artefacts": None, "truth": None}
+    return {
+        "patches": truth.patch_count,
+        "artefacts": None if truth.artefact is None else artefact_counts(truth.artefact),
+        "truth": truth.info,
+    }
 
 
 def chosen_views(part: Any, scanner: StripeScanner, text: str, overlap: float) -> tuple[View, ...]:
@@ -196,6 +223,18 @@ def _counts(scans: Scans) -> dict[str, Any]:
     }
 
 
+def artefact_counts(artefact: Any) -> dict[str, int]:
+    """Return the number of points of every class of artefact."""
+    import numpy as np
+
+    from octoseg_ti.types import Artefact
+
+    return {
+        kind.name.lower().replace("_", "-"): int(np.count_nonzero(artefact == kind))
+        for kind in Artefact
+    }
+
+
 def describe_scan(part: str, scans: Scans, truth: Truth) -> str:
     """Return the same in a line."""
     return _line(part, scan_summary(scans, truth))
@@ -204,7 +243,9 @@ def describe_scan(part: str, scans: Scans, truth: Truth) -> str:
 def _line(part: str, figures: dict[str, Any]) -> str:
     patches = figures["patches"]
     known = "no truth recorded" if patches is None else f"{patches} true patches"
+    artefacts = figures["artefacts"] or {}
+    counts = ", ".join(f"{n} {kind}" for kind, n in artefacts.items() if kind != "clean" and n)
     return (
         f"{part}: {figures['points']} points in {figures['stripes']} stripes and "
         f"{figures['views']} view(s), {known}"
-    )
+    ) + (f"; artefacts: {counts}" if counts else "")

@@ -21,14 +21,22 @@ from octoseg_ti.evaluation.points import (
     has_normal,
     normal_angles,
     point_spacing,
+    score_artefacts,
     score_edges,
     score_normals,
 )
 from octoseg_ti.evaluation.poses import pose_errors
-from octoseg_ti.evaluation.scores import EdgeScores, NormalScores, RegionScores, Scores
+from octoseg_ti.evaluation.scores import (
+    ArtefactScores,
+    EdgeScores,
+    NormalScores,
+    RegionScores,
+    Scores,
+)
 from octoseg_ti.types import EdgeClass, Truth
 
 __all__ = [
+    "ArtefactScores",
     "EdgeScores",
     "HooverCounts",
     "NormalScores",
@@ -73,11 +81,13 @@ def evaluate(
     patch = _labels("true patches", known.patch)
     edge = _column("edge", getattr(result, "edge", None), len(labels))
     normals = _column("normals", getattr(result, "normals", None), len(labels))
+    outlier = _column("outlier", getattr(result, "outlier", None), len(labels))
     for name, array in (
         ("true patches", patch),
         ("true edge distances", known.edge_distance),
         ("true edge classes", known.edge_class),
         ("true normals", known.normal),
+        ("true artefacts", known.artefact),
     ):
         _column(name, array, len(labels))
 
@@ -121,6 +131,11 @@ def evaluate(
         normals_interior=normal_scores_interior,
         edges=edges,
         edges_note=note,
+        artefacts=(
+            None
+            if outlier is None or known.artefact is None
+            else score_artefacts(outlier, known.artefact)
+        ),
         table=table,
         table_interior=inner_table,
     )

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from octoseg_ti.evaluation.scores import EdgeScores, NormalScores
-from octoseg_ti.types import EdgeClass, Truth
+from octoseg_ti.evaluation.scores import ArtefactScores, EdgeScores, NormalScores
+from octoseg_ti.types import Artefact, EdgeClass, Truth
 
 _SAMPLE = 20_000
 
@@ -96,6 +96,25 @@ def _edge_scores(found: np.ndarray, true: np.ndarray) -> EdgeScores:
         recall=hits / true_count if true_count else float("nan"),
         f1=2 * hits / (found_count + true_count) if found_count + true_count else float("nan"),
     )
+
+
+def score_artefacts(outlier: np.ndarray, artefact: np.ndarray) -> ArtefactScores:
+    """Score the points that cleaning marked.
+
+    Args:
+        outlier: Whether a point was marked, shape (N,).
+        artefact: `Artefact` of every point, shape (N,).
+    """
+    marked = np.asarray(outlier) != 0
+    scores = _edge_scores(marked, artefact != Artefact.CLEAN)
+    classes = {}
+    for kind in (Artefact.MIXED, Artefact.SPIKE, Artefact.MULTI_BOUNCE):
+        one = _edge_scores(marked, artefact == kind)
+        classes[kind.name.lower().replace("_", "-")] = (one.true, one.recall)
+    return ArtefactScores(
+        found=scores.found, true=scores.true, precision=scores.precision, recall=scores.recall,
+        f1=scores.f1, classes=classes,
+    )  # fmt: skip
 
 
 def point_spacing(result: Any, truth: Truth) -> tuple[float, str] | None:

@@ -77,6 +77,24 @@ class EdgeScores:
     """Harmonic mean of precision and recall."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArtefactScores:
+    """How well cleaning found the artefacts of the measurement."""
+
+    found: int
+    """Points marked as outliers."""
+    true: int
+    """Points with an artefact."""
+    precision: float
+    """Share of the marked points that have an artefact."""
+    recall: float
+    """Share of the points with an artefact that were marked."""
+    f1: float
+    """Harmonic mean of precision and recall."""
+    classes: dict[str, tuple[int, float]]
+    """Points and recall of every class of artefact: "mixed", "spike", "multi-bounce"."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scores:
     """The answer of `evaluate`. ``*_interior`` leaves the points near edges out."""
@@ -101,6 +119,8 @@ class Scores:
     """Scores of edge points under "all", "sharp" and "fillet"; empty without true edges."""
     edges_note: str
     """Why edge points were not scored; empty when they were."""
+    artefacts: ArtefactScores | None = None
+    """Scores of cleaning; None when the truth does not know artefacts or the result no outliers."""
     table: Overlap
     """Overlaps of patches and regions, all points."""
     table_interior: Overlap | None
@@ -148,6 +168,7 @@ class Scores:
                 name: {k: _plain(v) for k, v in dataclasses.asdict(score).items()}
                 for name, score in self.edges.items()
             },
+            "artefacts": _artefact_dict(self.artefacts),
         }
 
     def rows(self) -> list[tuple[str, str, str]]:
@@ -194,6 +215,16 @@ class Scores:
             )
         else:
             lines.append(f"edge points: not scored ({self.edges_note})")
+        if self.artefacts is not None:
+            a = self.artefacts
+            lines.append(f"{'cleaning':{width}}  {'precision':>10}  {'recall':>10}  {'F1':>10}")
+            lines.append(
+                f"{'  all artefacts':{width}}  {_value(a.precision):>10}  {_value(a.recall):>10}"
+                f"  {_value(a.f1):>10}"
+            )
+            for name, (points, recall) in a.classes.items():
+                what = f"  {name}, {points} points"
+                lines.append(f"{what:{width}}  {'':>10}  {_value(recall):>10}")
         return "\n".join(lines)
 
 
@@ -222,6 +253,17 @@ def _normal_dict(scores: NormalScores | None) -> dict[str, Any] | None:
         return None
     angles = {f"{k}_deg": math.degrees(getattr(scores, k)) for k in ("mean", "median", "p95")}
     return {"points": scores.points, **angles, "missing": scores.missing}
+
+
+def _artefact_dict(scores: ArtefactScores | None) -> dict[str, Any] | None:
+    if scores is None:
+        return None
+    values = {k: _plain(v) for k, v in dataclasses.asdict(scores).items() if k != "classes"}
+    classes = {
+        name: {"true": points, "recall": _plain(recall)}
+        for name, (points, recall) in scores.classes.items()
+    }
+    return {**values, "classes": classes}
 
 
 def _count(scores: Any, name: str) -> str:

@@ -83,17 +83,17 @@ def _reference_bits(reference: np.ndarray) -> np.ndarray:
 def pack_truth(truth: Truth, points: np.ndarray) -> bytes:
     """Return ``ground_truth.npz``: every array of the truth in point order, without loss.
 
-    ``patch``, ``surface``, ``kind``, ``edge_distance``, ``edge_class`` and ``T_world_view`` are
-    stored as they are;
-    ``position_byte0`` to 7 and ``normal_byte0`` to 7, each (N, 3) u8, hold the bytes of the f64
-    rows, lowest first, the positions XOR those of ``points``. This halves the file.
+    ``patch``, ``surface``, ``kind``, ``edge_distance``, ``edge_class``, ``artefact`` and
+    ``T_world_view`` are stored as they are; ``position_byte0`` to 7 and ``normal_byte0`` to 7, each
+    (N, 3) u8, hold the bytes of the f64 rows, lowest first, the positions XOR those of ``points``.
+    This halves the file.
 
     Args:
         truth: The truth.
         points: Positions as a reader of the recording sees them [mm], world frame, shape (N, 3).
     """
     arrays: dict[str, Any] = {"patch": truth.patch, "info": json.dumps(truth.info)}
-    for name in ("surface", "kind", "edge_distance", "edge_class", "T_world_view"):
+    for name in ("surface", "kind", "edge_distance", "edge_class", "artefact", "T_world_view"):
         if getattr(truth, name) is not None:
             arrays[name] = getattr(truth, name)
     if truth.position is not None:

@@ -49,7 +49,7 @@ def table(
     columns |= {name: getattr(what, name) for name in names if getattr(what, name) is not None}
     columns |= {name: rgba[:, i] for i, name in enumerate(("red", "green", "blue"))}
     if truth is not None:
-        for name in ("patch", "surface", "kind", "edge_distance", "edge_class"):
+        for name in ("patch", "surface", "kind", "edge_distance", "edge_class", "artefact"):
             if getattr(truth, name) is not None:
                 columns[f"truth_{name}"] = getattr(truth, name)
     return columns

@@ -123,11 +123,14 @@ def truth_rows(truth: Truth, scan: np.ndarray, points: np.ndarray) -> np.ndarray
     if truth.position is not None and truth.normal is not None:
         error = np.einsum("ij,ij->i", points - truth.position, truth.normal) / ERROR_STEP_MM
         rows["error_100nm"] = np.clip(np.rint(np.nan_to_num(error)), -32767, 32767)
+    if truth.artefact is not None:
+        rows["artefact"] = truth.artefact
     put_colors(rows, colors(truth.patch))
     return rows
 
 
-_PER_POINT = ("patch", "surface", "kind", "position", "normal", "edge_distance", "edge_class")
+_PER_POINT = ("patch", "surface", "kind", "position", "normal", "edge_distance", "edge_class",
+              "artefact")  # fmt: skip
 
 
 def part_of(truth: Truth, rows: slice) -> Truth:
@@ -158,6 +161,8 @@ def _truth_dtype(truth: Truth, position: str) -> np.dtype:
         fields += NORMAL
     if truth.position is not None and truth.normal is not None:
         fields.append(("error_100nm", "<i2"))
+    if truth.artefact is not None:
+        fields.append(("artefact", "|u1"))
     return np.dtype(fields + RGBA)
 
 

@@ -146,6 +146,7 @@ def make_truth(path: str | Path | None, values: dict[str, Any], count: int | Non
         ("surface", np.int32),
         ("kind", np.int8),
         ("edge_class", np.uint8),
+        ("artefact", np.uint8),
     ):
         if name in given:
             fields[name] = _integers(path, name, given[name], n, dtype)

@@ -327,6 +327,27 @@ def test_edge_scores_of_a_known_row():
     assert scores.regions_interior.labelled == pytest.approx(11 / 13)
 
 
+def test_artefact_scores_of_a_known_row():
+    artefact = np.array([0, 0, 0, 0, 1, 1, 1, 2, 2, 3], np.uint8)
+    outlier = np.array([0, 0, 0, 1, 1, 0, 0, 1, 1, 0], np.uint8)
+    labels = np.zeros(10, int)
+    truth = Truth(patch=labels, artefact=artefact)
+    a = evaluate(SimpleNamespace(labels=labels, outlier=outlier), truth).artefacts
+    assert (a.found, a.true, a.precision, a.recall) == (4, 6, 0.75, 0.5)
+    assert a.f1 == pytest.approx(0.6)
+    assert a.classes == {"mixed": (3, 1 / 3), "spike": (2, 1.0), "multi-bounce": (1, 0.0)}
+    scores = evaluate(SimpleNamespace(labels=labels, outlier=0 * outlier), truth)
+    values = scores.to_dict()["artefacts"]
+    assert values["precision"] is None and values["recall"] == 0.0
+    assert values["classes"]["spike"] == {"true": 2, "recall": 0.0}
+    assert "spike, 2 points" in str(scores)
+    for other in (SimpleNamespace(labels=labels), labels):
+        assert evaluate(other, truth).artefacts is None
+    assert evaluate(SimpleNamespace(labels=labels, outlier=outlier), labels).artefacts is None
+    with pytest.raises(DataError, match="artefacts"):
+        evaluate(labels, Truth(patch=labels, artefact=artefact[:3]))
+
+
 def test_default_edge_distance():
     result, truth = edge_case()
     scores = evaluate(result, truth)

@@ -68,6 +68,7 @@ def make(
         normal=normal,
         edge_distance=np.abs(np.sin(x) * y).astype(np.float32),
         edge_class=(column % 3).astype(np.uint8),
+        artefact=(column % 4).astype(np.uint8),
         info={"part": "factory", "seed": str(seed), "noise": str(noise)},
     )
     return scans, truth

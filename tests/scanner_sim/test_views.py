@@ -148,4 +148,6 @@ def test_what_cannot_be_planned_is_said() -> None:
     with pytest.raises(DataError, match="infinite"):
         plan_views(half_space((0, 0, 0), (0, 0, 1)))
     with pytest.raises(DataError, match="sees nothing"):
-        plan_views(part, StripeScanner(depth_of_field=1e-9, field_of_view=1e-9))
+        plan_views(part, StripeScanner(depth_of_field=1e-9))
+    with pytest.raises(DataError, match="too narrow for a part"):
+        plan_views(part, StripeScanner(field_of_view=1e-9))
