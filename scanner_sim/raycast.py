@@ -23,6 +23,7 @@ _SKIP_FALSE, _SKIP_TRUE = int(Op.SKIP_FALSE), int(Op.SKIP_TRUE)
 _FAR = 1e30
 _NEAR = 1e-9  # a hit closer to the origin of its ray than this is the origin itself [mm]
 _HALVINGS = 48
+_STILL = 4e-16  # a step this small, beside the root, is none
 _SLACK = 1e-5  # a hit may be this far outside of the box around the faces of its surface [mm]
 
 
@@ -200,16 +201,29 @@ def _quadratic(a, b, c):
 
 @ti.func
 def _between(c3, c2, c1, c0, lead, low, high):
-    """Return the root of lead t^4 + c3 t^3 + c2 t^2 + c1 t + c0 between two signs, by halving."""
+    """Return the root of lead t^4 + c3 t^3 + c2 t^2 + c1 t + c0 between two signs.
+
+    Newton's steps while they stay between the signs, halvings where they do not.
+    """
     rising = (((lead * low + c3) * low + c2) * low + c1) * low + c0 < 0.0
+    t = 0.5 * (low + high)
     for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        value = (((lead * middle + c3) * middle + c2) * middle + c1) * middle + c0
+        value = (((lead * t + c3) * t + c2) * t + c1) * t + c0
+        slope = ((4.0 * lead * t + 3.0 * c3) * t + 2.0 * c2) * t + c1
         if (value < 0.0) == rising:
-            low = middle
+            low = t
         else:
-            high = middle
-    return 0.5 * (low + high)
+            high = t
+        following = 0.5 * (low + high)
+        if slope != 0.0:
+            step = t - value / slope
+            if low < step < high:
+                following = step
+        moved = ti.abs(following - t)
+        t = following
+        if moved <= _STILL * ti.max(1.0, ti.abs(t)):
+            break
+    return t
 
 
 @ti.func
@@ -309,15 +323,17 @@ def _polished(data: ti.template(), s, origin, direction, t):
 
 
 @ti.func
-def _meets_box(boxes: ti.template(), b, origin, direction, reach):
-    """Say whether a ray meets box b within its reach."""
+def _meets_box(boxes: ti.template(), b, origin, direction, inverse, reach, slack):
+    """Say whether a ray meets box b, made larger by a slack, within its reach."""
     enter = 0.0
     leave = reach
     for k in ti.static(range(3)):
-        first = (boxes[b, k] - origin[k]) / direction[k]
-        second = (boxes[b, k + 3] - origin[k]) / direction[k]
+        low = boxes[b, k] - slack
+        high = boxes[b, k + 3] + slack
+        first = (low - origin[k]) * inverse[k]
+        second = (high - origin[k]) * inverse[k]
         if direction[k] == 0.0:  # parallel to these sides: between them for ever, or never
-            outer = origin[k] < boxes[b, k] or origin[k] > boxes[b, k + 3]
+            outer = origin[k] < low or origin[k] > high
             first = _FAR if outer else -_FAR
             second = _FAR
         enter = ti.max(enter, ti.min(first, second))
@@ -346,6 +362,7 @@ def nearest_hit(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
     best = reach
     surface = -1
     side = 0
+    inverse = 1.0 / direction
     pc = 0
     while pc < code.shape[0] and not (any_hit == 1 and surface >= 0):
         op = code[pc, 0]
@@ -353,20 +370,23 @@ def nearest_hit(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
         jump = code[pc, 2]
         pc += 1
         if op == _BOX:
-            if not _meets_box(boxes, arg, origin, direction, best):
+            if not _meets_box(boxes, arg, origin, direction, inverse, best, 0.0):
                 pc = jump
         elif op == _LEAF:
-            found = crossings(kinds[arg], data, arg, origin, direction)
-            for k in range(4):
-                t = found[k]
-                p = origin + t * direction
-                # Whoever is outside of this box need not be asked about the whole part.
-                if _NEAR < t < best and _in_box(faces, arg, p):
-                    bits = _solid_if(code, boxes, kinds, data, p, arg)
-                    if bits == 1 or bits == 2:
-                        best = t
-                        surface = arg
-                        side = 1 if bits == 2 else -1
+            # Nested, because `and` looks at both sides. A surface is asked where its faces can be,
+            # and the whole part only about crossings that are there.
+            if _meets_box(faces, arg, origin, direction, inverse, best, _SLACK):
+                found = crossings(kinds[arg], data, arg, origin, direction)
+                for k in range(4):
+                    t = found[k]
+                    if _NEAR < t < best:
+                        p = origin + t * direction
+                        if _in_box(faces, arg, p):
+                            bits = _solid_if(code, boxes, kinds, data, p, arg)
+                            if bits == 1 or bits == 2:
+                                best = t
+                                surface = arg
+                                side = 1 if bits == 2 else -1
     return ti.Vector([best, ti.f64(surface), ti.f64(side)])
 
 

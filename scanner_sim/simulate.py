@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from scanner_sim.target import Target
 
 _TRIAL_RAYS = 40_000
+_FEW_TRIAL_RAYS = 12_000
 _SURPLUS = 1.01  # aim this far above the wanted number; what is too much is thinned out
 _ATTEMPTS = 6
 
@@ -269,11 +270,13 @@ def _pitches(
     for view in views:
         low, high = extent(target.box, scanner, view)
         area += float(np.prod((high - low)[:2]))
-    across = math.sqrt(area / _TRIAL_RAYS * scanner.aspect)
+    # The trial of the plain scanner is finer than it need be: its scans are on record.
+    rays = _FEW_TRIAL_RAYS if scanner.effects else _TRIAL_RAYS
+    across = math.sqrt(area / rays * scanner.aspect)
     if wanted is None:
         return across, across / scanner.aspect
     # Without its width a line gives as many points, but for some at edges.
-    thin = replace(scanner, line_width=0.0)
+    thin = replace(scanner, line_width=0.0, specular=0.0)
     trial = [
         scan_pass(target, thin, view, across, across / scanner.aspect, (0, v))
         for v, view in enumerate(views)
