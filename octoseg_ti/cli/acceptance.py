@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from scanner_sim.acceptance import Acceptance
 
-PICTURE, TABLE = "phantom-points.png", "acceptance.json"
+PICTURE, TABLE, REPORT = "phantom-points.png", "acceptance.json", "acceptance.md"
 _WORDS = {
     "probing_form": "probing form, 25 mm ball, 95 %",
     "size_error": "size error, 25 mm ball",
@@ -40,7 +40,8 @@ class AcceptanceOptions:
 
     A ball, a plane and a step are scanned and fitted by least squares, and plates are tilted to see
     the noise grow; the figures stand beside the range that the scanner states. With -o the folder
-    gets them as JSON, and a cross-section of the step with the points that no surface has.
+    gets a report, the figures as JSON, and a cross-section of the step with the points that no
+    surface has.
     """
 
     preset: Annotated[ScannerName, tyro.conf.arg(aliases=["--scanner"])] = "default"
@@ -84,7 +85,7 @@ def run_acceptance(options: AcceptanceOptions) -> int:
     elif not options.quiet:
         out(describe(found, limits, options.preset))
         if options.output is not None:
-            out(f"\nwrote {options.output / TABLE}, {options.output / PICTURE}")
+            out(f"\nwrote {REPORT}, {TABLE} and {PICTURE} to {options.output}")
     return 0
 
 
@@ -111,22 +112,41 @@ def figures(found: Acceptance, limits: Limits, options: AcceptanceOptions) -> di
 
 def describe(found: Acceptance, limits: Limits, name: str) -> str:
     """Return the tables as text, in micrometres."""
+    return "\n\n".join(table(heads, rows) for heads, rows in _tables(found, limits, name))
+
+
+def markdown(found: Acceptance, limits: Limits, options: AcceptanceOptions) -> str:
+    """Return the report: the tables, the picture, and what was measured."""
+    lines = [
+        f"# Acceptance of the simulated scanner {options.preset}",
+        "",
+        "Artefacts as in ISO 10360-8 and VDI/VDE 2634, scanned with seed "
+        f"{options.seed} and fitted by least squares; the form is what holds 95 % of the points.",
+    ]
+    for heads, rows in _tables(found, limits, options.preset):
+        lines += ["", *(f"| {' | '.join(row)} |" for row in (heads, ["---"] * len(heads), *rows))]
+    lines += ["", f"![Cross-section of a 5 mm step]({PICTURE})", ""]
+    return "\n".join(lines)
+
+
+def _tables(
+    found: Acceptance, limits: Limits, name: str
+) -> list[tuple[list[str], list[list[str]]]]:
+    """Return heads and rows of the two tables, in micrometres."""
     rows = []
     for key, words in _WORDS.items():
         low, high = getattr(limits, key)
         value = getattr(found, key)
         within = "yes" if low <= value <= high else "NO"
-        rows.append(
-            [words, f"{1e3 * value:.2f}", f"{1e3 * low:g} to {1e3 * high:g}", within],
-        )
+        rows.append([words, f"{1e3 * value:.2f}", f"{1e3 * low:g} to {1e3 * high:g}", within])
     noise = [
         [f"{math.degrees(r.angle):.0f} deg", f"{1e3 * r.measured:.2f}", f"{1e3 * r.stated:.2f}"]
         for r in found.noise
     ]
-    return "\n\n".join([
-        table([f"scanner {name} [um]", "measured", "stated", "within"], rows),
-        table(["noise by angle of incidence [um]", "measured", "stated"], noise),
-    ])  # fmt: skip
+    return [
+        ([f"scanner {name} [um]", "measured", "stated", "within"], rows),
+        (["noise by angle of incidence [um]", "measured", "stated"], noise),
+    ]
 
 
 def write_folder(
@@ -139,6 +159,8 @@ def write_folder(
     text = json.dumps(plain(figures(found, limits, options)), indent=2)
     with replacing(folder / TABLE) as output:
         output.write(text.encode("utf-8"))
+    with replacing(folder / REPORT) as output:
+        output.write(markdown(found, limits, options).encode("utf-8"))
     with replacing(folder / PICTURE) as output:
         output.write(png(phantom_points(options.scanner, seed=options.seed)))
 

@@ -72,6 +72,8 @@ def test_acceptance_prints_figures_beside_what_is_stated(octoseg, tmp_path: Path
     for word in ("probing form", "size error", "flatness", "height error", "stated", "70 deg"):
         assert word in outcome.out
     assert "NO" not in outcome.out
+    report = (tmp_path / "new" / "acceptance.md").read_text("utf-8")
+    assert "| height error, 5 mm step |" in report and "](phantom-points.png)" in report
     figures = json.loads((tmp_path / "new" / "acceptance.json").read_text("utf-8"))
     assert figures["scanner"] == "modern" and figures["parameters"]["line_width"] == 0.08
     assert figures["probing_form"]["within"] and len(figures["noise"]) == 8
