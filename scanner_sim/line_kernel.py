@@ -8,6 +8,7 @@ half the line may then be overlooked by one row.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from scanner_sim.target import LIFT, CsgTarget
 _PLANE, _CYLINDER = int(SurfaceKind.PLANE), int(SurfaceKind.CYLINDER)
 _CONE, _SPHERE = int(SurfaceKind.CONE), int(SurfaceKind.SPHERE)
 _FAR = 1e30
+_IDLE = -2.0  # in place of a surface: nothing is to be seen in this row
 _CHUNK = 1 << 17
 
 
@@ -183,7 +185,8 @@ def _follow_rays(
         middle = 4 * (count // 2)
         known = first >= 3 and _alike(spots_inout, i, middle, 4 * (count - 1))
         lit = spots_inout[i, middle + 3] > 0.0
-        for turn in range(first, stop):
+        idle = first > 0 and spots_inout[i, middle + 1] == _IDLE
+        for turn in range(stop if idle else first, stop):
             k = 4 * _turn(turn, count)
             origin = source + line_in[k // 4, 0] * optics.across
             hit = vec3(_FAR, -1.0, 0.0)
@@ -329,9 +332,12 @@ def peaks_of_solid(solid: CsgTarget, scanner: StripeScanner, fan: Fan, middle: n
         hit = runtime.empty((rows, 3), np.int32)
         spots = runtime.empty((rows, 4 * len(offsets)), np.float64)
         rays = (*part, runtime.upload(source), ray, line, spots)
-        # The outer rays and the middle one first; the others follow them where they agree.
-        for first, stop in ((0, min(3, len(offsets))), (3, len(offsets))):
+        # The middle ray first, then the outer ones where there is light to be expected; the others
+        # follow these where they agree.
+        for first, stop in ((0, 1), (1, min(3, len(offsets))), (3, len(offsets))):
             if first < stop:
+                if first == 1:
+                    _rest(spots, source, columns, offsets)
                 _follow_rays(optics, first, stop, *rays)
                 _look_back(optics, first, stop, *rays)
         place = runtime.empty((rows, len(offsets)), np.float64)
@@ -340,6 +346,38 @@ def peaks_of_solid(solid: CsgTarget, scanner: StripeScanner, fan: Fan, middle: n
         runtime.sync()
         pieces.append(_gather(target, fan, source, offsets, start, value, hit))
     return Peaks(*(np.concatenate(column) for column in zip(*pieces, strict=True)))
+
+
+def _rest(spots: Any, source: np.ndarray, columns: int, offsets: np.ndarray) -> None:
+    """Let rows rest that lie amid the dark of one surface, or of none.
+
+    Their middle ray and those around them, as far as the line reaches and a row to either side,
+    have met the same surface, and none of them can be measured: too steep, or hidden from the
+    camera. Two thirds of the rows of a view from the side are of this kind.
+    """
+    stripes, count = len(source), len(offsets)
+    if stripes < 3 or columns < 3:
+        return
+    pitch = float(np.linalg.norm(np.diff(source, axis=0), axis=1).min())
+    around = math.ceil(float(np.abs(offsets).max()) / pitch) if pitch > 0.0 else stripes
+    if 2 * around + 1 > stripes:
+        return
+    host = runtime.download(spots).reshape(stripes, columns, count, 4)
+    middle = count // 2
+    dark = host[:, :, middle, 3] == 0.0
+    # One number a row: the surface where it is dark, a number that no surface has elsewhere.
+    state = np.where(dark, host[:, :, middle, 1], -9.0)
+    idle = np.zeros_like(dark)
+    inner = state[around : stripes - around, 1:-1]
+    same = inner > -9.0
+    for i in range(2 * around + 1):
+        for j in range(3):
+            same &= state[i : stripes - 2 * around + i, j : columns - 2 + j] == inner
+    idle[around : stripes - around, 1:-1] = same
+    host[idle] = 0.0
+    host[idle, middle, 1] = _IDLE
+    if not isinstance(spots, np.ndarray):
+        spots.from_numpy(host.reshape(spots.shape))
 
 
 def _gather(
