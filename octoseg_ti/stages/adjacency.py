@@ -62,7 +62,15 @@ def _find_touching(
                 box = at + step
                 b = -1
                 if level == 0:
-                    b = find_node(box[0], box[1], box[2], 0, shape, depth, root_in, child_in)
+                    if (
+                        box[0] >= 0
+                        and box[1] >= 0
+                        and box[2] >= 0
+                        and box[0] < shape[0]
+                        and box[1] < shape[1]
+                        and box[2] < shape[2]
+                    ):
+                        b = root_in[(box[0] * shape[1] + box[1]) * shape[2] + box[2]]
                 else:
                     beyond = ti.cast(step == side, ti.i32)
                     b = parents[(beyond[0] << 2) | (beyond[1] << 1) | beyond[2]]
