@@ -10,6 +10,8 @@ import numpy as np
 from octoseg_ti.errors import DataError
 from octoseg_ti.types import Scans
 
+_LONG_PIECE = 50  # rows; pieces that are shorter on average are gathered row by row
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Arranged:
@@ -160,20 +162,31 @@ def without(arranged: Arranged, marked: np.ndarray, rows: int) -> Arranged:
         DataError: Fewer than three points are left, or a single stripe.
     """
     assert arranged.run is not None and arranged.start is not None
-    kept = np.flatnonzero(~marked)
-    _need_three(len(kept), rows)
+    cut = np.flatnonzero(marked)
+    left = len(marked) - len(cut)
+    _need_three(left, rows)
     counts = np.diff(arranged.start) - np.bincount(
         arranged.run[marked], minlength=len(arranged.start) - 1
     )
     there = counts > 0
     _need_two(int(there.sum()))
     number = np.cumsum(there, dtype=np.int32) - np.int32(1)
-    run = arranged.run[kept]
+    # Marked points are few: what lies between them is copied in one piece each.
+    ends = np.append(cut, len(marked)).tolist()
+    pieces = [slice(a, b) for a, b in zip([0, *(cut + 1).tolist()], ends, strict=True) if a < b]
+    kept = np.flatnonzero(~marked) if len(pieces) * _LONG_PIECE > left else None
+
+    def without_cut(array: np.ndarray) -> np.ndarray:
+        if kept is not None:
+            return array.take(kept, axis=0)
+        return np.concatenate([array[piece] for piece in pieces])
+
+    run = without_cut(arranged.run)
     return Arranged(
-        row=arranged.row[kept],
-        points=arranged.points.take(kept, axis=0),
-        normals=None if arranged.normals is None else arranged.normals.take(kept, axis=0),
-        view=arranged.view[kept],
+        row=without_cut(arranged.row),
+        points=without_cut(arranged.points),
+        normals=None if arranged.normals is None else without_cut(arranged.normals),
+        view=without_cut(arranged.view),
         run=run if there.all() else number[run],
         start=np.concatenate([[0], np.cumsum(counts[there])]).astype(np.int32),
         whole=False,

@@ -138,13 +138,13 @@ def assemble(
     flat = 2.0 * measured.noise + 0.02 * spacing_of(measured)
     kind, parameters, residual = fit_planes(grid, leaves, cell_label[leaves], patches, limit=flat)
     n = len(scans)
-    rows = to_rows(grid, leaves, edge, label, name[:patches], point, normal, arranged.row, n)
     outlier = np.zeros(n, np.uint8)
     if not arranged.whole:
         outlier[:] = 1
         outlier[arranged.row] = 0
-        left_out = np.flatnonzero(outlier)
-        rows.points[left_out] = scans_in_world(scans, left_out)
+    left_out = np.flatnonzero(outlier)
+    rows = to_rows(grid, leaves, edge, label, name[:patches], point, normal, arranged.row, left_out)
+    rows.points[left_out] = scans_in_world(scans, left_out)
     mean = runtime.download(grid.mean)[leaves]
     cells = Cells(
         corner=grid.corner + node[leaves, X : Z + 1] * grid.edge_length[leaves, None],

@@ -169,7 +169,7 @@ def to_rows(
     points: np.ndarray,
     normals: np.ndarray,
     row: np.ndarray,
-    rows: int,
+    left_out: np.ndarray,
 ) -> Rows:
     """Bring what is known of the points into the order of the input.
 
@@ -182,7 +182,7 @@ def to_rows(
         points: Positions of the points of the grid as they were given [mm], shape (n, 3), f64.
         normals: Their unit normals, shape (n, 3), f64.
         row: Input row of every one of these points, shape (n,), i64.
-        rows: Number of input rows N.
+        left_out: The other rows of the input, shape (N - n,), i64.
 
     Returns:
         The rows.
@@ -193,11 +193,8 @@ def to_rows(
     leaf[:, 1] = leaf[:, 0] + grid.holds[leaves]
     leaf[:, 2] = runtime.download(grid.node)[leaves, LEVEL]
     leaf[:, 3] = edge
-    whole = len(row) == rows
-    labels, levels, edges = (
-        runtime.empty(rows, np.int32) if whole else runtime.upload(np.full(rows, value, np.int32))
-        for value in (NONE, -1, 0)
-    )
+    rows = len(row) + len(left_out)
+    labels, levels, edges = (runtime.empty(rows, np.int32) for _ in range(3))
     placed = runtime.empty((rows, 3), np.float64)
     turned = runtime.empty((rows, 3), np.float32)
     _scatter(
@@ -214,18 +211,16 @@ def to_rows(
         placed,
         turned,
     )
-    position, normal = runtime.download(placed), runtime.download(turned)
-    if not whole:
-        left_out = np.ones(rows, bool)
-        left_out[row] = False
-        position[left_out], normal[left_out] = np.nan, 0.0
-    return Rows(
-        points=position,
-        normals=normal,
+    found = Rows(
+        points=runtime.download(placed),
+        normals=runtime.download(turned),
         labels=runtime.download(labels),
         level=runtime.download(levels).astype(np.int8),
         edge=runtime.download(edges).astype(np.uint8),
     )
+    for array, value in zip(found, (np.nan, 0.0, NONE, -1, 0), strict=True):
+        array[left_out] = value
+    return found
 
 
 def points_of_leaves(grid: Grid, leaves: np.ndarray, values: np.ndarray) -> np.ndarray:
