@@ -9,7 +9,7 @@ import statistics
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter_ns
 from typing import Any
 
@@ -128,7 +128,9 @@ class Profile:
     stages: list[dict[str, Any]]
     """Rows of `stage_table`."""
     kernels: list[dict[str, Any]]
-    """Rows of `kernel_table` over the runs after the first."""
+    """Rows of `kernel_table` over the runs whose kernels were timed."""
+    watched: tuple[Trace, ...] = ()
+    """Runs of their own whose kernels were timed, where that was asked for."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -179,6 +181,32 @@ def measure(
         stages=stage_table(cold, runs, points=points, bytes_per_point=bytes_per_point),
         kernels=kernel_table(),
     )
+
+
+def measure_apart(work: Callable[[Trace], Any], **options: Any) -> Profile:
+    """Measure stages first, then kernels in runs of their own.
+
+    Taichi's clock around every kernel costs a third of a short run. So the stages are timed without
+    it, and Taichi is started anew to time the kernels.
+
+    Args:
+        work: As for `measure`.
+        **options: The other arguments of `measure`; the progress covers both halves.
+    """
+    from octoseg_ti.device import runtime
+
+    progress = options.pop("progress", None)
+
+    def half(offset: float) -> Callable[[float], None] | None:
+        return None if progress is None else lambda share: progress(offset + share / 2)
+
+    profile = measure(work, **options, progress=half(0.0))
+    runtime.restart(profile=True)
+    try:
+        watched = measure(work, **options, progress=half(0.5))
+    finally:
+        runtime.restart(profile=False)
+    return replace(profile, kernels=watched.kernels, watched=watched.runs)
 
 
 def stage_table(

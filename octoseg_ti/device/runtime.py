@@ -125,6 +125,18 @@ def start(
     return wanted
 
 
+def restart(*, profile: bool) -> Options:
+    """Start Taichi anew with the same options, but for the times of kernels.
+
+    Kernel arrays of a device are lost; compiled kernels are loaded again from the cache.
+    """
+    global _started
+    options = ensure_started()
+    ti.reset()
+    _started = None
+    return start(options.arch, threads=options.threads, debug=options.debug, profile=profile)
+
+
 def ensure_started() -> Options:
     """Start Taichi on the CPU unless it already runs, and return the options in force."""
     return _started if _started is not None else start()

@@ -84,11 +84,14 @@ def _source_lines(thorough: Callable[[Any], Any]) -> Callable[[Any], Any]:
         try:
             # As Taichi puts it together, so that the tree is there when it asks for it.
             text = "\n".join(_fill(line, tabsize=4, width=9999) for line in block)
-            body = _parse(textwrap.dedent(text)).body
+            text = textwrap.dedent(text)
+            tree = ast.parse(text)
+            body = tree.body
         except SyntaxError:
             body = []
         if len(body) != 1 or getattr(body[0], "name", "") != function.__name__:
             return thorough(function)  # type: ignore[no-any-return]
+        _keep(text, tree)
         return block, first + 1
 
     return lines_of
@@ -97,9 +100,25 @@ def _source_lines(thorough: Callable[[Any], Any]) -> Callable[[Any], Any]:
 _fill = functools.cache(textwrap.fill)
 
 
-@functools.cache
+_shared: dict[str, ast.Module] = {}
+_fresh: dict[str, ast.Module] = {}
+
+
 def _parse(text: str) -> ast.Module:
-    return ast.parse(text)
+    """Return the tree of a function's source; that of a function for kernels is parsed once.
+
+    Such a function is translated at each of its calls. Of a kernel Taichi changes the tree, and may
+    translate it again after a new start.
+    """
+    tree = _shared.get(text) or _fresh.pop(text, None)
+    return ast.parse(text) if tree is None else tree
+
+
+def _keep(text: str, tree: ast.Module) -> None:
+    """Keep a tree that has just been parsed for when Taichi asks for it."""
+    decorators = [d for node in tree.body for d in getattr(node, "decorator_list", [])]
+    shared = any(getattr(d, "attr", getattr(d, "id", "")) == "func" for d in decorators)
+    (_shared if shared else _fresh)[text] = tree
 
 
 def speed_up(kernel_impl: Any, transformer: Any) -> None:

@@ -80,3 +80,23 @@ def test_taichi_asks_no_server():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_kernels_run_again_after_a_new_start():
+    code = (
+        "import numpy as np\n"
+        "from octoseg_ti import segment\n"
+        "from octoseg_ti.device import runtime\n"
+        "from scanner_sim import simulate, StripeScanner, blocks\n"
+        "runtime.start(threads=1)\n"
+        "scans, _ = simulate(blocks.two_planes(), StripeScanner(points=2000), seed=1)\n"
+        "labels = [segment(scans).labels]\n"
+        "for profile in (True, False):\n"
+        "    runtime.restart(profile=profile)\n"
+        "    labels.append(segment(scans).labels)\n"
+        "assert all(np.array_equal(one, labels[0]) for one in labels)\n"
+        "print(runtime.running())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "threads=1" in done.stdout and "profile=False" in done.stdout
