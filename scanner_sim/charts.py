@@ -8,9 +8,10 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.types import SurfaceKind
+from scanner_sim.crossings import vector
 from scanner_sim.part import FlatPart
 from scanner_sim.quadric import frames
-from scanner_sim.raycast import _solid_if, _vector
+from scanner_sim.raycast import _solid_if
 
 _PLANE, _CYLINDER = int(SurfaceKind.PLANE), int(SurfaceKind.CYLINDER)
 _CONE, _SPHERE = int(SurfaceKind.CONE), int(SurfaceKind.SPHERE)
@@ -129,8 +130,8 @@ def _point(kinds: ti.template(), data: ti.template(), axes: ti.template(), s, sc
             radius, z = a + b * ti.cos(v), b * ti.sin(v)
         x, y = radius * ti.cos(u), radius * ti.sin(u)
     return (
-        _vector(data, s, 0) + x * _vector(axes, s, 0) + y * _vector(axes, s, 3)
-        + z * _vector(data, s, 3)
+        vector(data, s, 0) + x * vector(axes, s, 0) + y * vector(axes, s, 3)
+        + z * vector(data, s, 3)
     )  # fmt: skip
 
 

@@ -5,8 +5,9 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.types import SurfaceKind
+from scanner_sim.crossings import distance, vector
 from scanner_sim.part import FlatPart
-from scanner_sim.raycast import _distance, _solid_if, _vector
+from scanner_sim.raycast import _solid_if
 
 _PLANE, _CYLINDER = int(SurfaceKind.PLANE), int(SurfaceKind.CYLINDER)
 _CONE, _SPHERE = int(SurfaceKind.CONE), int(SurfaceKind.SPHERE)
@@ -115,8 +116,8 @@ def _arrays(index: np.ndarray, *rows: np.ndarray) -> tuple[object, ...]:
 @ti.func
 def _normal(kind, data: ti.template(), s, p):
     """Return the unit gradient of the distance to surface s."""
-    q = p - _vector(data, s, 0)
-    axis = _vector(data, s, 3)
+    q = p - vector(data, s, 0)
+    axis = vector(data, s, 3)
     height = q.dot(axis)
     result = axis
     if kind == _SPHERE:
@@ -139,7 +140,7 @@ def _normal(kind, data: ti.template(), s, p):
 def _onto(kind, data: ti.template(), s, p):
     """Return the place on surface s that is nearest to a place beside it."""
     for _ in ti.static(range(2)):
-        p -= _distance(kind, data, s, p) * _normal(kind, data, s, p)
+        p -= distance(kind, data, s, p) * _normal(kind, data, s, p)
     return p
 
 
@@ -170,7 +171,7 @@ def _walk(
     """Try places between two points of a face, until one is not on the part."""
     for i in range(index_in.shape[0]):
         s = index_in[i]
-        start, end = _vector(first_in, i, 0), _vector(second_in, i, 0)
+        start, end = vector(first_in, i, 0), vector(second_in, i, 0)
         whole = 1
         for k in range(_STEPS):
             if whole == 1:
@@ -199,8 +200,8 @@ def _look_aside(
     for i in range(index_in.shape[0]):
         s = index_in[i]
         kind = kinds_in[s]
-        p = _vector(points_in, i, 0)
-        across = _vector(runs_in, i, 0).cross(_normal(kind, data_in, s, p))
+        p = vector(points_in, i, 0)
+        across = vector(runs_in, i, 0).cross(_normal(kind, data_in, s, p))
         side = 0
         for k in range(2):
             if side == 0:
@@ -227,7 +228,7 @@ def _find_passing(
 ):
     """Count the surfaces of every piece into the place after its own; then write them down."""
     for i in range(index_in.shape[0]):
-        start, end = _vector(starts_in, i, 0), _vector(ends_in, i, 0)
+        start, end = vector(starts_in, i, 0), vector(ends_in, i, 0)
         middle = 0.5 * (start + end)
         found = 0
         for s in range(kinds_in.shape[0]):
@@ -235,10 +236,10 @@ def _find_passing(
             for k in ti.static(range(3)):
                 if middle[k] < limits_in[s, k] - slack or middle[k] > limits_in[s, k + 3] + slack:
                     near = False
-            if near and ti.abs(_distance(kinds_in[s], data_in, s, middle)) < slack:
+            if near and ti.abs(distance(kinds_in[s], data_in, s, middle)) < slack:
                 gap = ti.min(
-                    ti.abs(_distance(kinds_in[s], data_in, s, start)),
-                    ti.abs(_distance(kinds_in[s], data_in, s, end)),
+                    ti.abs(distance(kinds_in[s], data_in, s, start)),
+                    ti.abs(distance(kinds_in[s], data_in, s, end)),
                 )
                 if gap < touch:
                     if write == 1:

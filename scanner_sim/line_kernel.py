@@ -15,17 +15,15 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
-from octoseg_ti.types import SurfaceKind
+from scanner_sim.crossings import crossings, surface_normal
 from scanner_sim.line_profile import Fan, Peaks
 from scanner_sim.optics import merging, pixels_per_slope, shine, sub_rays
 from scanner_sim.part import FlatPart
 from scanner_sim.quadric import gradient
-from scanner_sim.raycast import crossings, nearest_hit
+from scanner_sim.raycast import ANY_INTO, FIRST_INTO, nearest_hit
 from scanner_sim.scanner import StripeScanner
 from scanner_sim.target import LIFT, CsgTarget
 
-_PLANE, _CYLINDER = int(SurfaceKind.PLANE), int(SurfaceKind.CYLINDER)
-_CONE, _SPHERE = int(SurfaceKind.CONE), int(SurfaceKind.SPHERE)
 _FAR = 1e30
 _IDLE = -2.0  # in place of a surface: nothing is to be seen in this row
 _CHUNK = 1 << 17
@@ -79,30 +77,6 @@ class Optics:
 
 
 @ti.func
-def _normal(kind, data: ti.template(), s, p):
-    """Return the gradient of the distance to surface s."""
-    q = p - vec3(data[s, 0], data[s, 1], data[s, 2])
-    axis = vec3(data[s, 3], data[s, 4], data[s, 5])
-    result = axis
-    if kind == _SPHERE:
-        result = q / ti.max(q.norm(), 1e-300)
-    elif kind != _PLANE:
-        height = q.dot(axis)
-        off = q - height * axis
-        radius = off.norm()
-        outward = off / ti.max(radius, 1e-300)
-        if kind == _CYLINDER:
-            result = outward
-        elif kind == _CONE:
-            result = ti.cos(data[s, 6]) * outward - ti.sin(data[s, 6]) * axis
-        else:
-            ring = radius - data[s, 6]
-            tube = ti.max(ti.sqrt(ring * ring + height * height), 1e-300)
-            result = (ring * outward + height * axis) / tube
-    return result
-
-
-@ti.func
 def _nearest_to(kind, data: ti.template(), s, origin, ray, wanted):
     """Return the crossing of a ray with surface s that is nearest to a distance."""
     found = crossings(kind, data, s, origin, ray)
@@ -145,7 +119,7 @@ def _brightness(optics: ti.template(), kinds: ti.template(), data: ti.template()
     surface = ti.i32(hit[1])
     if surface >= 0:
         place = origin + hit[0] * ray
-        normal = hit[2] * _normal(kinds[surface], data, surface, place)
+        normal = hit[2] * surface_normal(kinds[surface], data, surface, place)
         back = (camera - place).normalized()
         depth = hit[0] * ray.dot(optics.down)
         if (
@@ -192,7 +166,7 @@ def _follow_rays(
             hit = vec3(_FAR, -1.0, 0.0)
             if not known:
                 hit = nearest_hit(
-                    code_in, boxes_in, kinds_in, data_in, faces_in, origin, ray, _FAR, 0
+                    code_in, boxes_in, kinds_in, data_in, faces_in, origin, ray, _FAR, FIRST_INTO
                 )  # fmt: skip
             elif lit:
                 hit = vec3(0.0, spots_inout[i, middle + 1], spots_inout[i, middle + 2])
@@ -233,12 +207,12 @@ def _look_back(
             if spots_inout[i, k + 3] < 0.0:
                 surface = ti.i32(spots_inout[i, k + 1])
                 place = source + line_in[k // 4, 0] * optics.across + spots_inout[i, k] * ray
-                normal = _normal(kinds_in[surface], data_in, surface, place)
+                normal = surface_normal(kinds_in[surface], data_in, surface, place)
                 back = source + optics.camera - place
                 far = back.norm()
                 start = place + LIFT * spots_inout[i, k + 2] * normal
                 hit = nearest_hit(
-                    code_in, boxes_in, kinds_in, data_in, faces_in, start, back / far, far, 1
+                    code_in, boxes_in, kinds_in, data_in, faces_in, start, back / far, far, ANY_INTO
                 )  # fmt: skip
                 bright = -spots_inout[i, k + 3]
                 spots_inout[i, k + 3] = 0.0 if hit[1] > -0.5 else bright

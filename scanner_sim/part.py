@@ -35,7 +35,8 @@ class Op(IntEnum):
     """Instructions of the stack machine."""
 
     LEAF = 0
-    """Push the side of surface ``arg``; ``jump`` = 1 exchanges inside and outside."""
+    """Push the side of surface ``arg``; bit 0 of ``jump`` exchanges inside and outside, bit 1 says
+    that differences around it do so once more."""
     UNION = 1
     INTERSECTION = 2
     DIFFERENCE = 3
@@ -266,7 +267,7 @@ class _Flattener:
         self.surface_boxes: list[np.ndarray] = []
 
     def run(self, part: Part) -> FlatPart:
-        self._write(part, part.box, None, 1)
+        self._write(part, part.box, None, 1, False)
         return FlatPart(
             code=np.array(self.code, np.int32),
             boxes=np.array(self.boxes, np.float64).reshape(-1, 6),
@@ -274,13 +275,15 @@ class _Flattener:
             surface_boxes=np.array(self.surface_boxes),
         )
 
-    def _write(self, part: Part, limits: np.ndarray, tested: np.ndarray | None, depth: int) -> None:
+    def _write(
+        self, part: Part, limits: np.ndarray, tested: np.ndarray | None, depth: int, cut: bool
+    ) -> None:
         if depth > _MAX_DEPTH:
             raise DataError(f"a part may be nested {_MAX_DEPTH} operations deep, not more")
         # Nothing outside of the limits matters, so they also bound what is cut away.
         own = _meet(part.box, limits)
         if part.surface is not None:
-            self._write_leaf(part, own)
+            self._write_leaf(part, own, cut)
             return
         guard = None
         if np.isfinite(own).all() and (tested is None or not np.array_equal(own, tested)):
@@ -290,7 +293,8 @@ class _Flattener:
             tested = own
         skips = []
         for k, child in enumerate(part.children):
-            self._write(child, own, tested, depth + 1)
+            away = k > 0 and part.operation == Op.DIFFERENCE
+            self._write(child, own, tested, depth + 1, cut != away)
             if k > 0:
                 self.code.append([part.operation, 0, 0])
             if k + 1 < len(part.children):
@@ -300,7 +304,7 @@ class _Flattener:
         for place in [*skips, *([] if guard is None else [guard])]:
             self.code[place][2] = len(self.code)
 
-    def _write_leaf(self, part: Part, limits: np.ndarray) -> None:
+    def _write_leaf(self, part: Part, limits: np.ndarray, cut: bool) -> None:
         assert part.surface is not None
         form, flipped = canonical(part.surface)
         number = self.surfaces.setdefault(form.key(), len(self.forms))
@@ -311,4 +315,4 @@ class _Flattener:
             known = self.surface_boxes[number]
             known[0] = np.minimum(known[0], limits[0])
             known[1] = np.maximum(known[1], limits[1])
-        self.code.append([Op.LEAF, number, int(part.outside != flipped)])
+        self.code.append([Op.LEAF, number, int(part.outside != flipped) | int(cut) << 1])

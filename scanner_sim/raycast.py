@@ -12,18 +12,15 @@ import numpy as np
 
 from octoseg_ti.device import runtime
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, ti
-from octoseg_ti.types import SurfaceKind
+from scanner_sim.crossings import FAR, crossings, distance, surface_normal, vector
 from scanner_sim.part import FlatPart, Op
 
-_PLANE, _CYLINDER = int(SurfaceKind.PLANE), int(SurfaceKind.CYLINDER)
-_CONE, _SPHERE = int(SurfaceKind.CONE), int(SurfaceKind.SPHERE)
 _LEAF, _UNION, _INTERSECTION = int(Op.LEAF), int(Op.UNION), int(Op.INTERSECTION)
 _DIFFERENCE, _BOX = int(Op.DIFFERENCE), int(Op.BOX)
 _SKIP_FALSE, _SKIP_TRUE = int(Op.SKIP_FALSE), int(Op.SKIP_TRUE)
-_FAR = 1e30
 _NEAR = 1e-9  # a hit closer to the origin of its ray than this is the origin itself [mm]
-_HALVINGS = 48
-_STILL = 4e-16  # a step this small, beside the root, is none
+_ANY, _INTO = 1, 2  # modes of a ray: any hit will do; only ways into the solid count
+FIRST_INTO, ANY_INTO = _INTO, _ANY + _INTO
 _SLACK = 1e-5  # a hit may be this far outside of the box around the faces of its surface [mm]
 
 
@@ -46,6 +43,7 @@ def cast(
     reach: np.ndarray,
     *,
     any_hit: bool = False,
+    from_outside: bool = False,
 ) -> Hits:
     """Follow rays to the first surface of the solid.
 
@@ -55,6 +53,8 @@ def cast(
         directions: Unit vectors, shape (N, 3).
         reach: Length of every ray [mm], shape (N,); hits beyond it do not count.
         any_hit: Stop at any hit within reach, not the nearest one: enough to know what is hidden.
+        from_outside: Every ray begins outside of the solid. Then only the ways into it are looked
+            at, which is faster.
 
     Returns:
         One hit a ray.
@@ -63,14 +63,15 @@ def cast(
     count = len(origins)
     if count == 0:
         return Hits(np.empty(0), np.empty(0, np.int32), np.empty(0, np.int32))
-    limits = np.where(np.isfinite(reach), reach, _FAR).astype(np.float64)
+    limits = np.where(np.isfinite(reach), reach, FAR).astype(np.float64)
     distances = runtime.empty(count, np.float64)
     surfaces = runtime.empty(count, np.int32)
     sides = runtime.empty(count, np.int32)
     _cast_rays(
         runtime.upload(part.code), _boxes(part), runtime.upload(part.surfaces.kind),
         runtime.upload(part.surfaces.data), _rows(part.surface_boxes.reshape(-1, 6)),
-        _rows(origins), _rows(directions), runtime.upload(limits), int(any_hit),
+        _rows(origins), _rows(directions), runtime.upload(limits),
+        _ANY * int(any_hit) + _INTO * int(from_outside),
         distances, surfaces, sides,
     )  # fmt: skip
     runtime.sync()
@@ -114,33 +115,6 @@ def _boxes(part: FlatPart) -> object:
 
 
 @ti.func
-def _vector(rows: ti.template(), i, k):
-    """Read three neighbouring columns of a row."""
-    return ti.Vector([rows[i, k], rows[i, k + 1], rows[i, k + 2]])
-
-
-@ti.func
-def _distance(kind, data: ti.template(), s, p):
-    """Return the signed distance of a point to surface s."""
-    q = p - _vector(data, s, 0)
-    axis = _vector(data, s, 3)
-    height = q.dot(axis)
-    result = height
-    if kind != _PLANE:
-        radius = (q - height * axis).norm()
-        if kind == _CYLINDER:
-            result = radius - data[s, 6]
-        elif kind == _SPHERE:
-            result = q.norm() - data[s, 6]
-        elif kind == _CONE:
-            result = radius * ti.cos(data[s, 6]) - height * ti.sin(data[s, 6])
-        else:
-            ring = radius - data[s, 6]
-            result = ti.sqrt(ring * ring + height * height) - data[s, 7]
-    return result
-
-
-@ti.func
 def _solid_if(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
               data: ti.template(), p, surface):  # fmt: skip
     """Return two bits: is p solid if it is outside (bit 0) or inside (bit 1) of the surface?"""
@@ -154,8 +128,8 @@ def _solid_if(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
         if op == _LEAF:
             value = ti.i64(2)
             if arg != surface:
-                value = ti.i64(3) if _distance(kinds[arg], data, arg, p) <= 0.0 else ti.i64(0)
-            if jump == 1:
+                value = ti.i64(3) if distance(kinds[arg], data, arg, p) <= 0.0 else ti.i64(0)
+            if (jump & 1) == 1:
                 value = value ^ 3
             stack = (stack << 2) | value
         elif op == _BOX:
@@ -186,143 +160,6 @@ def _solid_if(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
 
 
 @ti.func
-def _quadratic(a, b, c):
-    """Return the roots of a t^2 + 2 b t + c, without cancellation; far away when there is none."""
-    roots = ti.Vector([_FAR, _FAR])
-    disc = b * b - a * c
-    if disc >= 0.0:
-        q = -(b + ti.sqrt(disc)) if b > 0.0 else -(b - ti.sqrt(disc))
-        if ti.abs(a) > 1e-14:
-            roots[0] = q / a
-        if ti.abs(q) > 1e-300:
-            roots[1] = c / q
-    return roots
-
-
-@ti.func
-def _between(c3, c2, c1, c0, lead, low, high):
-    """Return the root of lead t^4 + c3 t^3 + c2 t^2 + c1 t + c0 between two signs.
-
-    Newton's steps while they stay between the signs, halvings where they do not.
-    """
-    rising = (((lead * low + c3) * low + c2) * low + c1) * low + c0 < 0.0
-    t = 0.5 * (low + high)
-    for _ in range(_HALVINGS):
-        value = (((lead * t + c3) * t + c2) * t + c1) * t + c0
-        slope = ((4.0 * lead * t + 3.0 * c3) * t + 2.0 * c2) * t + c1
-        if (value < 0.0) == rising:
-            low = t
-        else:
-            high = t
-        following = 0.5 * (low + high)
-        if slope != 0.0:
-            step = t - value / slope
-            if low < step < high:
-                following = step
-        moved = ti.abs(following - t)
-        t = following
-        if moved <= _STILL * ti.max(1.0, ti.abs(t)):
-            break
-    return t
-
-
-@ti.func
-def _quartic(c2, c1, c0, limit):
-    """Return the roots of t^4 + c2 t^2 + c1 t + c0 within the limits, between its extrema.
-
-    The extrema are the roots of the derivative, found between the extrema of that one.
-    """
-    roots = ti.Vector([_FAR, _FAR, _FAR, _FAR])
-    turn = ti.sqrt(-c2 / 6.0) if c2 < 0.0 else 0.0
-    bends = ti.Vector([-limit, ti.max(-limit, -turn), ti.min(limit, turn), limit])
-    extrema = ti.Vector([-limit, limit, limit, limit, limit])
-    found = 1
-    for k in range(3):
-        low, high = bends[k], bends[k + 1]
-        slope_low = (4.0 * low * low + 2.0 * c2) * low + c1
-        slope_high = (4.0 * high * high + 2.0 * c2) * high + c1
-        if (slope_low < 0.0) != (slope_high < 0.0):
-            extrema[found] = _between(4.0, 0.0, 2.0 * c2, c1, 0.0, low, high)
-            found += 1
-    count = 0
-    for k in range(4):
-        low, high = extrema[k], extrema[k + 1]
-        value_low = ((low * low + c2) * low + c1) * low + c0
-        value_high = ((high * high + c2) * high + c1) * high + c0
-        if (value_low < 0.0) != (value_high < 0.0):
-            roots[count] = _between(0.0, c2, c1, c0, 1.0, low, high)
-            count += 1
-    return roots
-
-
-@ti.func
-def crossings(kind, data: ti.template(), s, origin, direction):
-    """Return where a ray crosses surface s: up to four distances, unused ones far away."""
-    found = ti.Vector([_FAR, _FAR, _FAR, _FAR])
-    axis = _vector(data, s, 3)
-    a = data[s, 6]
-    # Measured from the place nearest to the centre, the numbers stay small and exact.
-    start = (_vector(data, s, 0) - origin).dot(direction)
-    q = origin + start * direction - _vector(data, s, 0)
-    along = direction.dot(axis)
-    height = q.dot(axis)
-    if kind == _PLANE:
-        if ti.abs(along) > 1e-14:
-            found[0] = start - height / along
-    elif kind == _SPHERE:
-        pair = _quadratic(1.0, q.dot(direction), q.dot(q) - a * a)
-        found[0], found[1] = start + pair[0], start + pair[1]
-    elif kind == _CYLINDER or kind == _CONE:
-        off = q - height * axis
-        turn = direction - along * axis
-        k = ti.tan(a) * ti.tan(a) if kind == _CONE else 0.0
-        rest = 0.0 if kind == _CONE else a * a
-        pair = _quadratic(
-            turn.dot(turn) - k * along * along,
-            off.dot(turn) - k * height * along,
-            off.dot(off) - k * height * height - rest,
-        )
-        for m in ti.static(range(2)):
-            # The other half of the double cone is no part of the surface.
-            if kind == _CYLINDER or height + pair[m] * along >= 0.0:
-                found[m] = start + pair[m]
-    else:
-        b = data[s, 7]
-        m = q.dot(q)
-        limit = (a + b) * (a + b) - m
-        if limit > 0.0:
-            k = m + a * a - b * b
-            found = _quartic(
-                2.0 * k - 4.0 * a * a * (1.0 - along * along),
-                8.0 * a * a * height * along,
-                k * k - 4.0 * a * a * (m - height * height),
-                ti.sqrt(limit) + 1e-6,
-            )
-            for n in range(4):
-                if found[n] < _FAR:
-                    found[n] = start + _polished(
-                        data, s, origin + start * direction, direction, found[n]
-                    )
-    return found
-
-
-@ti.func
-def _polished(data: ti.template(), s, origin, direction, t):
-    """Return a root of the torus after two Newton steps on the distance itself."""
-    for _ in range(2):
-        q = origin + t * direction - _vector(data, s, 0)
-        axis = _vector(data, s, 3)
-        height = q.dot(axis)
-        off = q - height * axis
-        ring = off.norm() - data[s, 6]
-        tube = ti.sqrt(ring * ring + height * height)
-        slope = (ring / off.norm() * off.dot(direction) + height * axis.dot(direction)) / tube
-        if ti.abs(slope) > 1e-6:
-            t -= (tube - data[s, 7]) / slope
-    return t
-
-
-@ti.func
 def _meets_box(boxes: ti.template(), b, origin, direction, inverse, reach, slack):
     """Say whether a ray meets box b, made larger by a slack, within its reach."""
     enter = 0.0
@@ -334,8 +171,8 @@ def _meets_box(boxes: ti.template(), b, origin, direction, inverse, reach, slack
         second = (high - origin[k]) * inverse[k]
         if direction[k] == 0.0:  # parallel to these sides: between them for ever, or never
             outer = origin[k] < low or origin[k] > high
-            first = _FAR if outer else -_FAR
-            second = _FAR
+            first = FAR if outer else -FAR
+            second = FAR
         enter = ti.max(enter, ti.min(first, second))
         leave = ti.min(leave, ti.max(first, second))
     return enter <= leave
@@ -354,17 +191,19 @@ def _in_box(boxes: ti.template(), b, p):
 @ti.func
 def nearest_hit(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
                 data: ti.template(), faces: ti.template(),
-                origin, direction, reach, any_hit):  # fmt: skip
+                origin, direction, reach, mode):  # fmt: skip
     """Return (distance, surface or -1, side) of a ray's nearest hit, or of any within reach.
 
     The part's program is walked once; every crossing that is nearer than the best hit is tested.
+    The mode says whether any hit will do, and whether only ways into the solid are looked at: a
+    surface knows which of its sides is solid wherever it bounds the part.
     """
     best = reach
     surface = -1
     side = 0
     inverse = 1.0 / direction
     pc = 0
-    while pc < code.shape[0] and not (any_hit == 1 and surface >= 0):
+    while pc < code.shape[0] and not ((mode & _ANY) != 0 and surface >= 0):
         op = code[pc, 0]
         arg = code[pc, 1]
         jump = code[pc, 2]
@@ -381,7 +220,12 @@ def nearest_hit(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
                     t = found[k]
                     if _NEAR < t < best:
                         p = origin + t * direction
-                        if _in_box(faces, arg, p):
+                        asked = _in_box(faces, arg, p)
+                        if asked and (mode & _INTO) != 0:
+                            outside = (jump ^ (jump >> 1)) & 1  # the outside of it is solid
+                            slope = surface_normal(kinds[arg], data, arg, p).dot(direction)
+                            asked = slope > 0.0 if outside == 1 else slope < 0.0
+                        if asked:
                             bits = _solid_if(code, boxes, kinds, data, p, arg)
                             if bits == 1 or bits == 2:
                                 best = t
@@ -401,7 +245,7 @@ def _cast_rays(
     origins_in: F64Rows,
     directions_in: F64Rows,
     reach_in: F64Array,
-    any_hit: ti.i32,
+    mode: ti.i32,
     # Out:
     distances_out: F64Array,
     surfaces_out: I32Array,
@@ -410,8 +254,8 @@ def _cast_rays(
     """Follow every ray to its nearest hit."""
     for i in range(origins_in.shape[0]):
         hit = nearest_hit(
-            code_in, boxes_in, kinds_in, data_in, faces_in, _vector(origins_in, i, 0),
-            _vector(directions_in, i, 0), reach_in[i], any_hit,
+            code_in, boxes_in, kinds_in, data_in, faces_in, vector(origins_in, i, 0),
+            vector(directions_in, i, 0), reach_in[i], mode,
         )  # fmt: skip
         distances_out[i] = hit[0]
         surfaces_out[i] = ti.i32(hit[1])
@@ -433,7 +277,7 @@ def _classify_points(
     """Ask for every point whether its surface decides that it is solid."""
     for i in range(points_in.shape[0]):
         bits = _solid_if(
-            code_in, boxes_in, kinds_in, data_in, _vector(points_in, i, 0), surface_in[i]
+            code_in, boxes_in, kinds_in, data_in, vector(points_in, i, 0), surface_in[i]
         )
         side = 0
         if bits == 1:

@@ -111,7 +111,7 @@ class CsgTarget:
 
     def trace(self, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> TargetHits:
         """Follow rays to the first surface of the solid."""
-        hits = cast(self.flat, origins, directions, reach)
+        hits = cast(self.flat, origins, directions, reach, from_outside=True)
         found = np.flatnonzero(hits.surface >= 0)
         position = origins[found] + hits.distance[found, None] * directions[found]
         normal = np.zeros((len(origins), 3))
@@ -124,7 +124,8 @@ class CsgTarget:
     ) -> np.ndarray:
         """Return whether something stands in the way of points of the solid."""
         lifted = positions + LIFT * normals
-        hidden: np.ndarray = cast(self.flat, lifted, directions, reach, any_hit=True).surface >= 0
+        hits = cast(self.flat, lifted, directions, reach, any_hit=True, from_outside=True)
+        hidden: np.ndarray = hits.surface >= 0
         return hidden
 
     def truth(

@@ -119,6 +119,24 @@ def test_reach_and_shadow() -> None:
     np.testing.assert_array_equal(np.isfinite(brute), expected)
 
 
+@pytest.mark.parametrize("name", sorted(_solids()))
+def test_from_outside_the_ways_into_the_solid_are_enough(name: str) -> None:
+    flat = _solids()[name].flat()
+    origins, directions = _rays(600, seed=4)
+    endless = np.full(600, math.inf)
+    full = cast(flat, origins, directions, endless)
+    into = cast(flat, origins, directions, endless, from_outside=True)
+    for one, other in zip(full, into, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert (full.surface >= 0).sum() > 10
+    reach = np.where(np.isfinite(full.distance), full.distance, 40.0) - 1e-3
+    hidden = cast(flat, origins, directions, reach, any_hit=True, from_outside=True)
+    assert (hidden.surface < 0).all()
+    reach += 2e-3
+    hidden = cast(flat, origins, directions, reach, any_hit=True, from_outside=True)
+    np.testing.assert_array_equal(hidden.surface >= 0, full.surface >= 0)
+
+
 def test_rays_along_the_axes_meet_boxes() -> None:
     part = _solids()["boxes that share sides"]
     grid = np.linspace(-2.9, 2.9, 30)
