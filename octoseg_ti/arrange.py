@@ -147,7 +147,8 @@ def arrange(scans: Scans) -> Arranged:
     first = np.flatnonzero(new)
     _need_two(len(first))
     start = np.append(first, len(row)).astype(np.int32)
-    return _arranged(scans, row, view, np.cumsum(new, dtype=np.int32) - np.int32(1), start, whole)
+    run = np.repeat(np.arange(len(first), dtype=np.int32), np.diff(start))
+    return _arranged(scans, row, view, run, start, whole)
 
 
 def without(arranged: Arranged, marked: np.ndarray, rows: int) -> Arranged:
@@ -170,7 +171,7 @@ def without(arranged: Arranged, marked: np.ndarray, rows: int) -> Arranged:
     )
     there = counts > 0
     _need_two(int(there.sum()))
-    number = np.cumsum(there, dtype=np.int32) - np.int32(1)
+    stripes, counts = np.flatnonzero(there), counts[there]
     # Marked points are few: what lies between them is copied in one piece each.
     ends = np.append(cut, len(marked)).tolist()
     pieces = [slice(a, b) for a, b in zip([0, *(cut + 1).tolist()], ends, strict=True) if a < b]
@@ -181,14 +182,13 @@ def without(arranged: Arranged, marked: np.ndarray, rows: int) -> Arranged:
             return array.take(kept, axis=0)
         return np.concatenate([array[piece] for piece in pieces])
 
-    run = without_cut(arranged.run)
     return Arranged(
         row=without_cut(arranged.row),
         points=without_cut(arranged.points),
         normals=None if arranged.normals is None else without_cut(arranged.normals),
-        view=without_cut(arranged.view),
-        run=run if there.all() else number[run],
-        start=np.concatenate([[0], np.cumsum(counts[there])]).astype(np.int32),
+        view=np.repeat(arranged.view[arranged.start[stripes]], counts),
+        run=np.repeat(np.arange(len(stripes), dtype=np.int32), counts),
+        start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
         whole=False,
     )
 

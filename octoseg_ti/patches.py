@@ -14,6 +14,7 @@ from octoseg_ti.stages.adjacency import find_touching
 from octoseg_ti.stages.assignment import (
     assign_points,
     claimed_share,
+    points_in,
     points_of_leaves,
     to_rows,
 )
@@ -130,7 +131,7 @@ def assemble(
     """Number the patches by size, find the planes, and bring all into the input order."""
     node = runtime.download(grid.node)[: grid.count]
     patches = int(cell_label.max(initial=NONE)) + 1
-    size = np.bincount(label + 1, minlength=patches + 1)[1:]
+    size = _sizes(grid, leaves, cell_label[leaves], label, patches)
     rank = np.argsort(-size, kind="stable")
     name = np.full(patches + 1, NONE, np.int32)
     name[rank] = np.arange(patches, dtype=np.int32)
@@ -164,6 +165,18 @@ def assemble(
         parameters=parameters, residual=residual, cells=cells, stripe=scans.stripe,
         view=scans.view, params=params, measured=measured, passes=grid.passes, name=scans.name,
     )  # fmt: skip
+
+
+def _sizes(
+    grid: Grid, leaves: np.ndarray, leaf_label: np.ndarray, label: np.ndarray, patches: int
+) -> np.ndarray:
+    """Return the points of every patch; in most cells all points have the label of the cell."""
+    inside = leaf_label >= 0
+    whole = np.bincount(
+        leaf_label[inside], weights=grid.holds[leaves[inside]], minlength=patches
+    ).astype(np.int64)
+    rest = label[points_in(grid, leaves[~inside])]
+    return whole + np.bincount(rest[rest >= 0], minlength=patches)
 
 
 def scans_in_world(scans: Scans, rows: np.ndarray) -> np.ndarray:

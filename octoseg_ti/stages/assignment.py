@@ -237,7 +237,7 @@ def points_of_leaves(grid: Grid, leaves: np.ndarray, values: np.ndarray) -> np.n
     return np.repeat(values, grid.holds[leaves])
 
 
-def _points_in(grid: Grid, cells: np.ndarray) -> np.ndarray:
+def points_in(grid: Grid, cells: np.ndarray) -> np.ndarray:
     """Return the sorted points in some cells, cell after cell, i32."""
     holds = grid.holds[cells]
     ends = np.cumsum(holds, dtype=np.int32)
@@ -285,7 +285,7 @@ def assign_points(
     if only is not None:
         asked &= only[leaves]
     asked = leaves[asked]
-    index = _points_in(grid, asked)
+    index = points_in(grid, asked)
     on_bend = None
     if bend.any():
         on_bend = np.repeat(np.where(bend[asked], asked, NONE).astype(np.int32), grid.holds[asked])
@@ -336,7 +336,7 @@ def claimed_share(
         return np.zeros(groups)
     count = grid.holds[inside]
     begin = np.cumsum(count) - count
-    labelled = np.add.reduceat((label[_points_in(grid, inside)] >= 0).astype(np.int32), begin)
+    labelled = np.add.reduceat((label[points_in(grid, inside)] >= 0).astype(np.int32), begin)
     total = np.bincount(group[inside], weights=count, minlength=groups)
     found = np.bincount(group[inside], weights=labelled, minlength=groups)
     return found / np.maximum(total, 1)
