@@ -1,0 +1,393 @@
+"""Where the fit of a plane, cylinder, cone, sphere and torus begins: closed forms over moments.
+
+A line along the normal of a surface of revolution meets its axis. With k = p x n and the moment
+m = c x a of an axis through c along a this reads a.k + m.n = 0, linear in the axis and blind to
+the sign of the normals (the linear line complex; Pottmann & Wallner 2001, Computational Line
+Geometry, section 6). So a few directions are tried as axis, each gets its place from the normals,
+and in the half plane of distance and height the surface is a line or a circle.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.device.linalg import mat3, row, vec2, vec3
+from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, ti
+from octoseg_ti.device.surfaces import CONE, CYLINDER, KINDS, PLANE, SPHERE, TORUS
+
+_DIRECTIONS = 5  # tried as axis
+_FAR = 1e3  # no start is farther from the points than this, in units of their extent
+_RIDGE = 1e-6  # of the mean square of the normals: keeps what they leave open near the points
+
+STATE = 11
+"""Numbers of a state: point (3), axis (3), a direction across it (3), shape (2)."""
+
+
+class Moments(NamedTuple):
+    """Means over the samples of every group, with q = (p - centre) / extent and k = q x n."""
+
+    weight: np.ndarray
+    """Sum of the weights, (G,)."""
+    centre: np.ndarray
+    """Centre [mm], (G, 3)."""
+    extent: np.ndarray
+    """Root mean square distance from the centre [mm], (G,)."""
+    qq: np.ndarray
+    nn: np.ndarray
+    kk: np.ndarray
+    nk: np.ndarray
+    """Mean outer products, (G, 3, 3)."""
+    wq: np.ndarray
+    """Mean of |q|^2 q, (G, 3)."""
+    n: np.ndarray
+    nnq: np.ndarray
+    """Mean of n and of n (n.q), (G, 3)."""
+    q: np.ndarray
+    """Mean of q where there is a normal, zero elsewhere, (G, 3)."""
+    ww: np.ndarray
+    """Mean of |q|^4, (G,)."""
+
+
+_COLUMNS = 5 + 36 + 12 + 1
+
+
+@ti.kernel
+def _gather_moments(
+    groups: ti.i32,
+    stride: ti.i32,
+    # In:
+    point_in: F64Rows,
+    normal_in: F64Rows,
+    weight_in: F64Array,
+    start_in: I32Array,
+    # Out:
+    moment_out: F64Rows,
+):
+    """Write sums over the samples of every group; a second round about the centre of the first."""
+    for t in range(groups * stride):
+        if t % stride == 0:
+            g = t // stride
+            total = 0.0
+            centre = vec3(0.0, 0.0, 0.0)
+            for i in range(start_in[g], start_in[g + 1]):
+                total += weight_in[i]
+                centre += weight_in[i] * row(point_in, i)
+            centre = centre / ti.max(total, 1e-300)
+            square = 0.0
+            qq = mat3(0.0)
+            nn = mat3(0.0)
+            kk = mat3(0.0)
+            nk = mat3(0.0)
+            wq = vec3(0.0, 0.0, 0.0)
+            sn = vec3(0.0, 0.0, 0.0)
+            nnq = vec3(0.0, 0.0, 0.0)
+            sq = vec3(0.0, 0.0, 0.0)
+            for i in range(start_in[g], start_in[g + 1]):
+                w = weight_in[i]
+                q = row(point_in, i) - centre
+                n = row(normal_in, i)
+                wn = w * n
+                wk = q.cross(wn)
+                c = q.norm_sqr()
+                square += w * c * c
+                qq += w * q.outer_product(q)
+                nn += wn.outer_product(n)
+                kk += wk.outer_product(q.cross(n))
+                nk += n.outer_product(wk)
+                wq += w * c * q
+                sn += wn
+                nnq += n.dot(q) * wn
+                sq += w * n.norm_sqr() * q
+            moment_out[g, 0] = total
+            moment_out[g, 4] = square
+            for a in ti.static(range(3)):
+                moment_out[g, 1 + a] = centre[a]
+                moment_out[g, 41 + a] = wq[a]
+                moment_out[g, 44 + a] = sn[a]
+                moment_out[g, 47 + a] = nnq[a]
+                moment_out[g, 50 + a] = sq[a]
+                for b in ti.static(range(3)):
+                    moment_out[g, 5 + 3 * a + b] = qq[a, b]
+                    moment_out[g, 14 + 3 * a + b] = nn[a, b]
+                    moment_out[g, 23 + 3 * a + b] = kk[a, b]
+                    moment_out[g, 32 + 3 * a + b] = nk[a, b]
+
+
+def gather_moments(
+    points: np.ndarray, normals: np.ndarray, weight: np.ndarray, start: np.ndarray
+) -> Moments:
+    """Return the moments of every group; arguments as of `fit_all`, all given."""
+    runtime.ensure_started()
+    groups = len(start) - 1
+    raw = runtime.empty((groups, _COLUMNS), np.float64)
+    stride = runtime.workers()[1]
+    _gather_moments(
+        groups,
+        stride,
+        runtime.upload(points),
+        runtime.upload(normals),
+        runtime.upload(weight),
+        runtime.upload(start),
+        raw,
+    )
+    m = runtime.download(raw)[:groups]
+    total = np.maximum(m[:, 0], 1e-300)
+    mean = m[:, 4:] / total[:, None]
+    matrices = mean[:, 1:37].reshape(groups, 4, 3, 3)
+    square = np.trace(matrices[:, 0], axis1=1, axis2=2)
+    extent = np.sqrt(square)
+    e = np.where(extent > 0.0, extent, 1.0)
+    e1, e2 = e[:, None], e[:, None, None]
+    return Moments(
+        m[:, 0],
+        m[:, 1:4],
+        extent,
+        matrices[:, 0] / e2**2,
+        matrices[:, 1],
+        matrices[:, 2] / e2**2,
+        matrices[:, 3] / e2,
+        mean[:, 37:40] / e1**3,
+        mean[:, 40:43],
+        mean[:, 43:46] / e1,
+        mean[:, 46:49] / e1,
+        mean[:, 0] / e**4,
+    )
+
+
+@ti.kernel
+def _gather_profiles(
+    tasks: ti.i32,
+    stride: ti.i32,
+    # In:
+    point_in: F64Rows,
+    normal_in: F64Rows,
+    weight_in: F64Array,
+    start_in: I32Array,
+    frame_in: F64Rows,
+    axis_in: F64Rows,
+    # Out:
+    moment_out: F64Rows,
+):
+    """Write sums over x = rho - its middle and z of every group about every axis tried."""
+    for t in range(tasks * stride):
+        if t % stride == 0:
+            j = t // stride
+            g = j // _DIRECTIONS
+            origin = row(axis_in, j)
+            axis = vec3(axis_in[j, 3], axis_in[j, 4], axis_in[j, 5])
+            middle = origin.norm()
+            s = vec3(0.0, 0.0, 0.0)
+            xz = vec3(0.0, 0.0, 0.0)
+            cq = vec3(0.0, 0.0, 0.0)
+            nn = vec3(0.0, 0.0, 0.0)
+            tq = vec2(0.0, 0.0)
+            for i in range(start_in[g], start_in[g + 1]):
+                w = weight_in[i]
+                q = (row(point_in, i) - row(frame_in, g)) * frame_in[g, 3] - origin
+                n = row(normal_in, i)
+                z = axis.dot(q)
+                away = q - z * axis
+                rho = away.norm()
+                x = rho - middle
+                nz = n.dot(axis)
+                nx = n.dot(away) / ti.max(rho, 1e-12)
+                c = x * x + z * z
+                s += w * vec3(x, z, c)
+                xz += w * vec3(x * x, x * z, z * z)
+                cq += w * vec3(c * x, c * z, c * c)
+                nn += w * vec3(nx * nx, nx * nz, nz * nz)
+                tq += (w * (nx * z - nz * x)) * vec2(-nz, nx)
+            for k in ti.static(range(3)):
+                moment_out[j, k] = s[k]
+                moment_out[j, 3 + k] = xz[k]
+                moment_out[j, 6 + k] = cq[k]
+                moment_out[j, 9 + k] = nn[k]
+            moment_out[j, 12] = tq[0]
+            moment_out[j, 13] = tq[1]
+
+
+def _solve(matrix: np.ndarray, right: np.ndarray, ridge: float = 1e-12) -> np.ndarray:
+    """Return the solutions of stacked symmetric systems, kept finite where they are singular."""
+    value, vector = np.linalg.eigh(matrix)
+    floor = np.maximum(ridge * np.abs(value).max(axis=-1, keepdims=True), 1e-300)
+    part = np.einsum("...ji,...j->...i", vector, right) / np.maximum(value, floor)
+    return np.einsum("...ij,...j->...i", vector, part)
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    size = np.linalg.norm(v, axis=-1, keepdims=True)
+    return np.divide(v, size, out=np.zeros_like(v), where=size > 0)
+
+
+def _limited(v: np.ndarray) -> np.ndarray:
+    """Return vectors cut to the longest that is allowed."""
+    size = np.linalg.norm(v, axis=-1, keepdims=True)
+    return v * np.minimum(1.0, _FAR / np.maximum(size, 1e-300))
+
+
+def across(axis: np.ndarray) -> np.ndarray:
+    """Return a unit vector at right angles to each axis, shape (..., 3)."""
+    other = np.where(np.abs(axis[..., :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    return _unit(np.cross(axis, other))
+
+
+def _axes(m: Moments) -> np.ndarray:
+    """Return the axes to try, point and direction in scaled units, shape (G, _DIRECTIONS, 6)."""
+    size = np.trace(m.nn, axis1=1, axis2=2)
+    size = np.where(size > 0.0, size, 1.0)[:, None, None]
+    centred = m.nn - m.n[:, :, None] * m.n[:, None, :] / size
+    inverse = np.linalg.inv(m.nn + (1e-4 * size) * np.eye(3))
+    line = m.kk - np.swapaxes(m.nk, 1, 2) @ inverse @ m.nk
+    finite = np.nan_to_num(np.stack((m.nn, centred, (line + np.swapaxes(line, 1, 2)) / 2, m.qq)))
+    vector = np.linalg.eigh(finite)[1]
+    axis = np.stack((*vector[:, :, :, 0], vector[3, :, :, 2]), axis=1)
+    u = across(axis)
+    v = np.cross(axis, u)
+    basis = np.stack((u, v), axis=-1)  # (G, D, 3, 2)
+    system = np.swapaxes(basis, -1, -2) @ m.nn[:, None] @ basis + (_RIDGE * size[:, None]) * np.eye(
+        2
+    )
+    right = -np.einsum("gdic,gij,gdj->gdc", basis, m.nk, axis)
+    moment = np.einsum("gdic,gdc->gdi", basis, _solve(system, right))
+    return np.concatenate((_limited(np.cross(axis, moment)), axis), axis=-1)
+
+
+def _spheres(m: Moments) -> tuple[np.ndarray, np.ndarray]:
+    """Return centre and radius of a sphere to start from: lines along normals, or an algebraic fit.
+
+    Of the two the one with the smaller deviation, to first order (E|q|^2 = 1 by the scale).
+    """
+    size = np.trace(m.nn, axis1=1, axis2=2)[:, None, None]
+    lines = _solve(size * np.eye(3) - m.nn, m.q - m.nnq, _RIDGE)
+    algebraic = _solve(m.qq, m.wq / 2.0, _RIDGE)
+    centre = _limited(np.stack((lines, algebraic), axis=1))
+    square = 1.0 + np.sum(centre**2, axis=-1)
+    spread = (
+        (m.ww - 1.0)[:, None]
+        - 4.0 * np.einsum("gci,gi->gc", centre, m.wq)
+        + 4.0 * np.einsum("gci,gij,gcj->gc", centre, m.qq, centre)
+    )
+    best = np.argmin(spread / square, axis=1)
+    rows = np.arange(len(best))
+    return centre[rows, best], np.sqrt(square[rows, best])
+
+
+def _profile_means(
+    points: np.ndarray,
+    normals: np.ndarray,
+    weight: np.ndarray,
+    start: np.ndarray,
+    m: Moments,
+    axes: np.ndarray,
+) -> np.ndarray:
+    """Return the means in the half planes of all axes, shape (G, D, 14)."""
+    groups = len(start) - 1
+    frame = np.column_stack((m.centre, 1.0 / np.where(m.extent > 0.0, m.extent, 1.0)))
+    tasks = groups * _DIRECTIONS
+    raw = runtime.empty((tasks, 14), np.float64)
+    _gather_profiles(
+        tasks,
+        runtime.workers()[1],
+        runtime.upload(points),
+        runtime.upload(normals),
+        runtime.upload(weight),
+        runtime.upload(start),
+        runtime.upload(frame),
+        runtime.upload(axes.reshape(tasks, 6)),
+        raw,
+    )
+    sums = runtime.download(raw)[:tasks].reshape(groups, _DIRECTIONS, 14)
+    return sums / np.maximum(m.weight, 1e-300)[:, None, None]
+
+
+def _lines(f: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (angle h, offset s, mean square deviation) of the line in every half plane.
+
+    The line of least deviation; where the normals contradict it by more than 45 degrees, the one
+    that they ask for.
+    """
+    xx, xz, zz = f[..., 3] - f[..., 0] ** 2, f[..., 4] - f[..., 0] * f[..., 1], f[..., 5]
+    zz = zz - f[..., 1] ** 2
+    # The direction of least spread is half a turn of the doubled angle from that of most.
+    points = 0.5 * np.arctan2(-2.0 * xz, zz - xx)
+    asked = 0.5 * np.arctan2(2.0 * f[..., 10], f[..., 9] - f[..., 11])
+    far = np.abs(np.cos(points - asked)) < np.sqrt(0.5)
+    turn = np.where(far, asked, points)
+    c, s = np.cos(turn), np.sin(turn)
+    square = c * c * xx + 2.0 * c * s * xz + s * s * zz
+    return -turn, c * (f[..., 0] + middle) + s * f[..., 1], square
+
+
+def _circles(
+    f: np.ndarray, middle: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return (ring radius, height, tube radius, mean square deviation) in every half plane."""
+    mean, c = f[..., :2], f[..., 2]
+    cov = f[..., [[3, 4], [4, 5]]] - mean[..., :, None] * mean[..., None, :]
+    cq = f[..., 6:8] - c[..., None] * mean
+    cc = f[..., 8] - c * c
+    # From the normals: t.(q - centre) = 0 with t at right angles to n; and by the points alone.
+    tt = f[..., [[11, 10], [10, 9]]] * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    centre = np.stack((_solve(tt, f[..., 12:14], _RIDGE), _solve(cov, cq / 2.0, _RIDGE)), axis=-2)
+    centre = _limited(centre)
+    off = centre - mean[..., None, :]
+    tube = np.sqrt(np.trace(cov, axis1=-2, axis2=-1)[..., None] + np.sum(off**2, axis=-1))
+    spread = (
+        cc[..., None]
+        - 4.0 * np.einsum("...ci,...i->...c", centre, cq)
+        + 4.0 * np.einsum("...ci,...ij,...cj->...c", centre, cov, centre)
+    )
+    square = spread / (4.0 * np.maximum(tube, 1e-12) ** 2)
+    ring = centre[..., 0] + middle[..., None]
+    square = np.where(ring > 0.0, square, np.inf)
+    best = np.argmin(square, axis=-1)[..., None]
+
+    def take(a: np.ndarray) -> np.ndarray:
+        return np.take_along_axis(a, best, axis=-1)[..., 0]
+
+    return np.maximum(take(ring), 0.0), take(centre[..., 1]), take(tube), take(square)
+
+
+def starts(
+    points: np.ndarray, normals: np.ndarray, weight: np.ndarray, start: np.ndarray, m: Moments
+) -> np.ndarray:
+    """Return a state of every group and kind to start from, shape (G, KINDS, STATE).
+
+    Args:
+        points: Positions [mm], shape (S, 3), f64.
+        normals: Normals, shape (S, 3), f64; their sign does not matter; zero = none.
+        weight: Weights, shape (S,), f64.
+        start: First sample of every group, and S at the end, shape (G + 1,), i32.
+        m: The moments of the groups.
+
+    Returns:
+        Point, axis, a direction across it and shape, as `profile` reads it, in units of the extent
+        of the group about its centre.
+    """
+    groups = len(start) - 1
+    state = np.zeros((groups, KINDS, STATE))
+    axes = _axes(m)
+    f = np.nan_to_num(_profile_means(points, normals, weight, start, m, axes))
+    middle = np.linalg.norm(axes[..., :3], axis=-1)
+    rows = np.arange(groups)
+
+    def place(kind: int, square: np.ndarray, height: np.ndarray, *shape: np.ndarray) -> None:
+        best = np.argmin(np.nan_to_num(square, nan=np.inf), axis=1)
+        axis = axes[rows, best, 3:]
+        state[:, kind, :3] = axes[rows, best, :3] + height[rows, best, None] * axis
+        state[:, kind, 3:6] = axis
+        for k, values in enumerate(shape):
+            state[:, kind, 9 + k] = values[rows, best]
+
+    zero = np.zeros(middle.shape)
+    place(CYLINDER, f[..., 3] - f[..., 0] ** 2, zero, f[..., 0] + middle)
+    angle, offset, square = _lines(f, middle)
+    place(CONE, square, zero, angle, offset)
+    ring, height, tube, square = _circles(f, middle)
+    place(TORUS, square, height, ring, tube)
+    state[:, SPHERE, :3], state[:, SPHERE, 9] = _spheres(m)
+    state[:, SPHERE, 5] = 1.0
+    state[:, PLANE, 3:6] = np.linalg.eigh(np.nan_to_num(m.qq))[1][:, :, 0]
+    state[:, :, 6:9] = across(state[:, :, 3:6])
+    return state
