@@ -3,7 +3,10 @@
 The root of a set is its smallest member, whatever the order of the unions and the threads.
 """
 
-from octoseg_ti.device.runtime import ti
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.device.runtime import I32Array, ti
 
 
 @ti.func
@@ -31,3 +34,38 @@ def unite(parent: ti.template(), a: ti.i32, b: ti.i32):
         else:
             x = find(parent, old)
             y = find(parent, low)
+
+
+@ti.kernel
+def _join(
+    # In:
+    a_in: I32Array,
+    b_in: I32Array,
+    # Out:
+    parent_inout: I32Array,
+):
+    """Join the two members of every pair, then let every member point to its root."""
+    for i in a_in:
+        unite(parent_inout, a_in[i], b_in[i])
+    for i in parent_inout:
+        parent_inout[i] = find(parent_inout, i)
+
+
+def components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the connected component of every member of a graph, by its smallest member.
+
+    Args:
+        count: Number of members.
+        a: One end of every edge, shape (e,), i32.
+        b: Its other end, shape (e,), i32.
+
+    Returns:
+        Smallest member of the component of every member, shape (count,), i32.
+    """
+    runtime.ensure_started()
+    parent = runtime.upload(np.arange(count, dtype=np.int32))
+    if len(a):
+        _join(
+            runtime.upload(np.asarray(a, np.int32)), runtime.upload(np.asarray(b, np.int32)), parent
+        )
+    return runtime.download(parent)

@@ -55,6 +55,8 @@ class Grid:
     """Index of the points in Morton order, shape (n,), i32."""
     point: Any
     """Points in Morton order, relative to ``corner`` [mm], shape (n, 3), f64."""
+    normal: Any
+    """Their unit normals, shape (n, 3), f64."""
     key: Any
     """Morton key of the smallest box of every sorted point, shape (n,), i64."""
     root: Any
@@ -427,7 +429,7 @@ def build_grid(
     sizes = size / 2.0 ** np.arange(AXIS_BITS + 1)
     return Grid(
         corner=corner, size=size, shape=shape, depth=depth, signed=signed, count=count, order=order,
-        point=sorted_point, key=key, root=root, node=node, child=child, mean=mean, moment=moment,
+        point=sorted_point, normal=sorted_normal, key=key, root=root, node=node, child=child, mean=mean, moment=moment,
         passes=passes,
         first=lo, holds=host[:, HI] - lo, edge_length=sizes[host[:, LEVEL]],
     )  # fmt: skip

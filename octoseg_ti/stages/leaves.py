@@ -1,0 +1,169 @@
+"""The leaves of the sparse grid as a graph: which touch, and a few points to speak for each.
+
+A few points of every leaf (samples) stand for all of them where surfaces are sought: where a
+surface is curved the leaves are small, so that the samples are dense exactly where they have to be.
+The points of a leaf are picked by a hash of their coordinates: which ones does not depend on the
+order in which they were scanned.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
+from octoseg_ti.stages.adjacency import Adjacency
+from octoseg_ti.stages.grid import Grid
+
+# Odd numbers with well mixed bits (the first digits of the roots of 2, 3 and 5, times 2^63).
+_MIX = (0x6A09E667F3BCC909, 0x5DB3D742C265539D, 0x1E3779B97F4A7C15)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Leaves:
+    """The ``C`` leaves of a grid in Morton order, and the pairs of them that touch."""
+
+    node: np.ndarray
+    """Their nodes, shape (C,), i32."""
+    first: np.ndarray
+    """First sorted point of every leaf, shape (C,), i32."""
+    count: np.ndarray
+    """Points of every leaf, shape (C,), i32."""
+    size: np.ndarray
+    """Edge length of every leaf [mm], shape (C,), f64."""
+    a: np.ndarray
+    """One leaf of every pair that touches, shape (E,), i32."""
+    b: np.ndarray
+    """The other one, shape (E,), i32."""
+    start: np.ndarray
+    """First entry of every leaf in ``neighbor``, and 2 E at the end, shape (C + 1,), i32."""
+    neighbor: np.ndarray
+    """The leaves that touch each leaf, ascending, shape (2 E,), i32."""
+
+    def __len__(self) -> int:
+        """Return the number of leaves."""
+        return len(self.node)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Samples:
+    """Some points of every leaf, leaf after leaf, ``A`` in all."""
+
+    index: np.ndarray
+    """The sorted points that they are, shape (A,), i32."""
+    leaf: np.ndarray
+    """Leaf of every sample, shape (A,), i32."""
+    point: np.ndarray
+    """Position relative to the corner of the grid [mm], shape (A, 3), f64."""
+    normal: np.ndarray
+    """Unit normal, shape (A, 3), f64."""
+    weight: np.ndarray
+    """How many points a sample stands for, shape (A,), f64."""
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self.leaf)
+
+
+@ti.func
+def _hash(p: ti.template(), i: ti.i32) -> ti.i64:
+    """Return a number that looks random and depends on nothing but the coordinates."""
+    h = ti.i64(0)
+    for k in ti.static(range(3)):
+        h = (h ^ ti.bit_cast(p[i, k], ti.i64)) * ti.i64(_MIX[k])
+        h = h ^ (h >> 29)
+    return h
+
+
+@ti.kernel
+def _pick(
+    most: ti.i32,
+    # In:
+    point_in: F64Rows,
+    taken_in: I32Array,
+    leaf_in: I32Rows,
+    # Out:
+    index_out: I32Rows,
+    count_out: I32Array,
+):
+    """Write the points of every leaf with the smallest hashes, of those not taken; count these."""
+    for c in count_out:
+        free = 0
+        last = ti.i64(-0x7FFFFFFFFFFFFFFF)
+        for s in range(most):
+            best = ti.i64(0x7FFFFFFFFFFFFFFF)
+            found = -1
+            for i in range(leaf_in[c, 0], leaf_in[c, 0] + leaf_in[c, 1]):
+                if taken_in[i] < 0:
+                    if s == 0:
+                        free += 1
+                    h = _hash(point_in, i)
+                    if h > last and h < best:
+                        best = h
+                        found = i
+            index_out[c, s] = found
+            last = best
+        count_out[c] = free
+
+
+def leaf_graph(grid: Grid, node: np.ndarray, touching: Adjacency) -> Leaves:
+    """Return the leaves of a grid and the pairs of them that touch.
+
+    Args:
+        grid: The sparse grid.
+        node: The nodes that are leaves, in Morton order, shape (C,).
+        touching: The touching pairs of leaves.
+    """
+    place = np.zeros(grid.count, np.int32)
+    place[node] = np.arange(len(node), dtype=np.int32)
+    count = runtime.download(touching.count)[: grid.count]
+    neighbor = runtime.download(touching.neighbor)[: grid.count]
+    held = np.arange(neighbor.shape[1], dtype=np.int32) < count[:, None]
+    a = place[np.repeat(np.arange(grid.count), count)]
+    b = place[neighbor[held]]
+    one, other = np.concatenate([a, b]), np.concatenate([b, a])
+    order = np.argsort(one.astype(np.int64) * len(node) + other, kind="stable")
+    ends = np.cumsum(np.bincount(one, minlength=len(node)))
+    return Leaves(
+        node=node,
+        first=grid.first[node],
+        count=grid.holds[node],
+        size=grid.edge_length[node],
+        a=a,
+        b=b,
+        start=np.concatenate([[0], ends]).astype(np.int32),
+        neighbor=other[order],
+    )
+
+
+def sample_leaves(
+    grid: Grid, leaves: Leaves, most: int, *, label: np.ndarray | None = None
+) -> Samples:
+    """Return up to ``most`` points of every leaf.
+
+    Args:
+        grid: The sparse grid.
+        leaves: Its leaves.
+        most: Largest number of points of a leaf.
+        label: Label of every sorted point, shape (n,), i32: only points without one (-1) are
+            picked and counted; None = all.
+    """
+    runtime.ensure_started()
+    n = grid.order.shape[0]
+    taken = np.full(n, -1, np.int32) if label is None else label
+    index = runtime.empty((len(leaves), most), np.int32)
+    free = runtime.empty(len(leaves), np.int32)
+    table = np.stack([leaves.first, leaves.count], axis=1)
+    _pick(most, grid.point, runtime.upload(taken), runtime.upload(table), index, free)
+    picked, there = runtime.download(index), runtime.download(free)
+    found = picked >= 0
+    each = found.sum(axis=1)
+    leaf = np.repeat(np.arange(len(leaves), dtype=np.int32), each)
+    picked = picked[found]
+    return Samples(
+        index=picked,
+        leaf=leaf,
+        point=runtime.download(grid.point)[picked],
+        normal=runtime.download(grid.normal)[picked],
+        weight=np.repeat(there / np.maximum(each, 1), each),
+    )

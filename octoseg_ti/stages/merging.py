@@ -1,0 +1,211 @@
+"""Surfaces that are one are merged; surfaces that their neighbours explain are given up."""
+
+import numpy as np
+
+from octoseg_ti.stages.extraction import Surfaces, fit_sets, lie_on, spread
+from octoseg_ti.stages.leaves import Leaves, Samples
+from octoseg_ti.types import NONE
+
+# Samples of each surface in a common fit.
+_SAMPLES = 150
+# Two surfaces are one when the residual of neither grows by more than this.
+_WORSE = 1.15
+# ... and stays within this many noises.
+_FIT = 1.2
+# Distances beyond this many noises count as this many.
+_CAP = 4.0
+# A surface with fewer samples says nothing about another.
+_FEW = 10
+
+
+def contacts(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pairs of surfaces that have points in one leaf or in leaves that touch.
+
+    Args:
+        leaves: The leaves.
+        own: Surfaces with points in every leaf, ascending, then -1; shape (C, most), i32.
+
+    Returns:
+        The pairs, smaller number first, ascending, shape (P, 2); and how many leaves and pairs of
+        leaves each was found in, shape (P,).
+    """
+    held = (own >= 0).sum(axis=1)
+    cells = np.arange(len(own), dtype=np.int32)
+    a, b = np.concatenate([leaves.a, cells]), np.concatenate([leaves.b, cells])
+    alike = (held[a] == 1) & (held[b] == 1) & (own[a, 0] == own[b, 0])
+    some = ~alike & (held[a] > 0) & (held[b] > 0)
+    a, b = a[some], b[some]
+    each = held[a] * held[b]
+    at = np.repeat(np.arange(len(a)), each)
+    rank = np.arange(len(at)) - np.repeat(np.cumsum(each) - each, each)
+    one, other = own[a[at], rank // held[b[at]]], own[b[at], rank % held[b[at]]]
+    differ = one != other
+    low, high = np.minimum(one, other)[differ], np.maximum(one, other)[differ]
+    width = int(own.max(initial=0)) + 1
+    key, count = np.unique(low.astype(np.int64) * width + high, return_counts=True)
+    return np.stack([key // width, key % width], axis=1), count
+
+
+def members_of(label: np.ndarray, count: int) -> list[np.ndarray]:
+    """Return the samples of every label, ascending, an array of indices for each."""
+    order = np.argsort(label, kind="stable")
+    ends = np.searchsorted(label[order], np.arange(count + 1))
+    return [order[lo:hi] for lo, hi in zip(ends[:-1], ends[1:], strict=True)]
+
+
+def merge_surfaces(
+    samples: Samples, label: np.ndarray, surfaces: Surfaces, pairs: np.ndarray, noise: float
+) -> tuple[np.ndarray, Surfaces]:
+    """Merge surfaces in contact that one surface explains as well.
+
+    Args:
+        samples: The samples.
+        label: Surface of every sample, -1 = none, shape (A,), i32.
+        surfaces: The surfaces.
+        pairs: Surfaces in contact, shape (P, 2).
+        noise: Deviation of a point from its surface [mm].
+
+    Returns:
+        The surface that each one becomes, shape (M,), i32; and the surfaces, of which those that
+        stay have been fitted anew where they were merged.
+    """
+    name = np.arange(len(surfaces), dtype=np.int32)
+    members = members_of(label, len(surfaces))
+    size = np.array([len(m) for m in members], np.int64)
+    pairs = pairs[(size[pairs] >= _FEW).all(axis=1)]
+    if len(pairs) == 0:
+        return name, surfaces
+    parts = [spread(m, _SAMPLES) for m in members]
+    groups = [np.concatenate([parts[a], parts[b]]) for a, b in pairs]
+    fitted, common = fit_sets(samples, groups, noise)
+    if len(fitted) == 0:
+        return name, surfaces
+    pairs = pairs[fitted]
+    mixed, own = _residuals(samples, parts, pairs, common, surfaces, noise)
+    fine = (mixed <= np.maximum(_WORSE * own, noise)) & (mixed <= _FIT * noise)
+    order = np.argsort(mixed.max(axis=1, initial=0.0), kind="stable")
+    parameters, kind = surfaces.parameters.copy(), surfaces.kind.copy()
+    used = np.zeros(len(surfaces), bool)
+    for p in order[fine[order].all(axis=1)]:
+        a, b = pairs[p]
+        if used[a] or used[b]:
+            continue
+        used[[a, b]] = True
+        keep, drop = (a, b) if size[a] >= size[b] else (b, a)
+        name[drop] = keep
+        parameters[keep], kind[keep] = common.parameters[p], common.kind[p]
+    return name, Surfaces(kind=kind, parameters=parameters)
+
+
+def _residuals(
+    samples: Samples,
+    parts: list[np.ndarray],
+    pairs: np.ndarray,
+    common: Surfaces,
+    surfaces: Surfaces,
+    noise: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the residual of either part of a pair, from the common surface and from its own."""
+    which = pairs.ravel()
+    twice = np.repeat(np.arange(len(pairs)), 2)
+    mixed = capped_rms(samples, parts, which, common.at(twice), noise)
+    own = capped_rms(samples, parts, np.arange(len(surfaces)), surfaces, noise)
+    return mixed.reshape(-1, 2), own[pairs]
+
+
+def capped_rms(
+    samples: Samples, sets: list[np.ndarray], which: np.ndarray, surfaces: Surfaces, noise: float
+) -> np.ndarray:
+    """Return the residual of a set of samples from every surface, far samples capped [mm].
+
+    Args:
+        samples: The samples.
+        sets: Sets of samples.
+        which: The set that every surface is compared with, shape (M,).
+        surfaces: The surfaces.
+        noise: Deviation of a point from its surface [mm]; distances count as 4 of it at most.
+    """
+    from octoseg_ti.device.surfaces import evaluate_surfaces
+
+    length = np.array([len(s) for s in sets], np.int64)[which]
+    index = np.concatenate([sets[w] for w in which])
+    owner = np.repeat(np.arange(len(which)), length)
+    far, _ = evaluate_surfaces(samples.point[index], owner, surfaces.kind, surfaces.parameters)
+    square = np.minimum(far**2, (_CAP * noise) ** 2)
+    return np.sqrt(np.bincount(owner, square, len(which)) / np.maximum(length, 1))
+
+
+def explained_by_others(
+    label: np.ndarray, second: np.ndarray, off: np.ndarray, count: int, limit: float
+) -> np.ndarray:
+    """Return which surfaces their neighbours explain nearly as well.
+
+    Args:
+        label: Surface of every point, -1 = none, shape (n,), i32.
+        second: The surface that each point would choose next, -1 = none, shape (n,), i32.
+        off: Distance from that surface [noises], shape (n,).
+        count: Number of surfaces M.
+        limit: Largest mean square of these distances.
+
+    Returns:
+        Which surfaces to give up, shape (M,), bool: the smallest first, and none that one given up
+        leans on.
+    """
+    here = label >= 0
+    mine, other = label[here], second[here]
+    square = np.where(other >= 0, np.minimum(off[here], _CAP) ** 2, _CAP**2)
+    size = np.bincount(mine, minlength=count)
+    mean = np.bincount(mine, square, minlength=count) / np.maximum(size, 1)
+    given_up = np.zeros(count, bool)
+    leaned_on = np.zeros(count, bool)
+    key = mine.astype(np.int64) * count + np.where(other >= 0, other, mine)
+    pair, points = np.unique(key, return_counts=True)
+    for m in np.argsort(size, kind="stable"):
+        if size[m] == 0 or mean[m] > limit or leaned_on[m]:
+            continue
+        lo, hi = np.searchsorted(pair, [m * count, (m + 1) * count])
+        heirs = (pair[lo:hi] % count)[points[lo:hi] * 5 >= size[m]]
+        if given_up[heirs].any():
+            continue
+        given_up[m] = True
+        leaned_on[heirs] = True
+    return given_up
+
+
+def pieces(leaves: Leaves, own: np.ndarray, count: int) -> np.ndarray:
+    """Return the connected pieces of the surfaces.
+
+    Args:
+        leaves: The leaves.
+        own: Surfaces with points in every leaf, ascending, then -1; shape (C, most), i32.
+        count: Number of surfaces M.
+
+    Returns:
+        Piece of every entry of ``own``, named by its first entry, -1 where there is none; shape
+        (C, most), i32.
+    """
+    from octoseg_ti.device.unionfind import components
+
+    most = own.shape[1]
+    entry = np.flatnonzero(own.ravel() >= 0)
+    number = np.full(own.size, NONE, np.int64)
+    number[entry] = np.arange(len(entry))
+    table = number.reshape(own.shape)
+    ends_a, ends_b = [], []
+    for k in range(most):  # where the two leaves of a pair share a surface
+        there = own[leaves.a, k] >= 0
+        if not there.any():
+            break
+        a, b = leaves.a[there], leaves.b[there]
+        same = own[b] == own[a, k][:, None]
+        hit = same.any(axis=1)
+        ends_a.append(table[a[hit], k])
+        ends_b.append(table[b[hit], same[hit].argmax(axis=1)])
+    if not ends_a:
+        return np.full(own.shape, NONE, np.int32)
+    root = components(
+        len(entry), np.concatenate(ends_a).astype(np.int32), np.concatenate(ends_b).astype(np.int32)
+    )
+    piece = np.full(own.size, NONE, np.int32)
+    piece[entry] = root
+    return piece.reshape(own.shape)

@@ -1,0 +1,237 @@
+"""From groups of cells to surfaces and to the points that lie on them.
+
+Groups that the flood fill found are explained by analytic surfaces; every point takes the surface
+near it that it fits best; points that fit none form new groups, until nothing new is found. Then
+surfaces that are one are merged, and surfaces that their neighbours explain are given up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.device.unionfind import components
+from octoseg_ti.stages.extraction import (
+    Surfaces,
+    Tolerance,
+    explain,
+    fit_sets,
+    lie_on,
+    no_surfaces,
+    spread,
+)
+from octoseg_ti.stages.grid import Grid
+from octoseg_ti.stages.labelling import Choice, Rule, label_points, own_lists, surface_table
+from octoseg_ti.stages.leaves import Leaves, Samples, sample_leaves
+from octoseg_ti.stages.merging import (
+    contacts,
+    explained_by_others,
+    members_of,
+    merge_surfaces,
+    pieces,
+)
+from octoseg_ti.types import NONE
+
+_ROUNDS = 3
+# Points of a leaf that speak for it: of all its points, and of those that fit nothing.
+_SAMPLES, _REST = 4, 6
+# A leaf takes part in a new group when so many of its points fit nothing.
+_LEFT_POINTS = 2
+# Samples for fitting a surface anew.
+_REFIT = 300
+# A surface is given up when its neighbours explain its points with this mean square, in noises.
+_EXPLAINED = 2.0
+_MERGES = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Surfaced:
+    """The surfaces of a part and the points on them."""
+
+    surfaces: Surfaces
+    """The surfaces, relative to the corner of the grid."""
+    label: np.ndarray
+    """Surface of every sorted point, -1 = none, shape (n,), i32."""
+    own: np.ndarray
+    """Surfaces with points in every leaf, ascending, then -1; shape (C, most), i32."""
+
+
+class _Search:
+    """What the rounds of the search share."""
+
+    def __init__(self, grid: Grid, leaves: Leaves, tolerance: Tolerance, rule: Rule) -> None:
+        self.grid, self.leaves, self.tolerance, self.rule = grid, leaves, tolerance, rule
+        self.samples = sample_leaves(grid, leaves, _SAMPLES)
+        self.surfaces = no_surfaces()
+        self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
+        self.choice: Choice | None = None
+
+    @property
+    def label(self) -> np.ndarray:
+        """Return the label of every sorted point."""
+        assert self.choice is not None
+        return runtime.download(self.choice.label)
+
+    def choose(self, passes: int = 1) -> None:
+        """Let the points choose among the surfaces that have points near them."""
+        table = surface_table(
+            self.surfaces.kind, self.surfaces.parameters, np.zeros(len(self.surfaces))
+        )
+        self.choice, self.own = label_points(
+            self.grid, self.leaves, self.own, table, self.rule, passes=passes
+        )
+
+    def add(self, samples: Samples, sets: list[np.ndarray]) -> bool:
+        """Explain sets of samples; say whether that gave any new surface."""
+        new, label = explain(samples, self.leaves, sets, self.tolerance)
+        if len(new) == 0:
+            return False
+        base = len(self.surfaces)
+        self.surfaces = self.surfaces.joined(new)
+        there = label >= 0
+        cell, rank = np.nonzero(self.own >= 0)
+        self.own = own_lists(
+            self.leaves,
+            np.concatenate([cell, samples.leaf[there]]),
+            np.concatenate([self.own[cell, rank], label[there] + base]),
+        )
+        return True
+
+    def refit(self) -> None:
+        """Fit the surfaces anew to the samples that chose them."""
+        label = self.label[self.samples.index]
+        members = members_of(label, len(self.surfaces))
+        which = np.array([m for m, s in enumerate(members) if len(s) >= 10], np.int64)
+        sets = [spread(members[m], _REFIT) for m in which]
+        noise = self.tolerance.noise
+        fitted, fits = fit_sets(self.samples, sets, noise, robust=True)
+        new = lie_on(self.samples, sets, fitted, fits, 3.0 * noise, 0.5)
+        old = lie_on(
+            self.samples, sets, fitted, self.surfaces.at(which[fitted]), 3.0 * noise, 0.5
+        )
+        kind, parameters = self.surfaces.kind.copy(), self.surfaces.parameters.copy()
+        for k, f in enumerate(fitted):
+            if new[k].mean() >= old[k].mean() - 0.01:
+                kind[which[f]], parameters[which[f]] = fits.kind[k], fits.parameters[k]
+        self.surfaces = Surfaces(kind=kind, parameters=parameters)
+
+    def rename(self, name: np.ndarray) -> None:
+        """Give surfaces other numbers; -1 gives them up."""
+        there = self.own >= 0
+        cell = np.nonzero(there)[0]
+        self.own = own_lists(self.leaves, cell, name[self.own[there]])
+
+    def rest(self) -> tuple[Samples, list[np.ndarray]]:
+        """Return samples of the points that fit nothing, in connected sets."""
+        label, leaves = self.label, self.leaves
+        left = np.add.reduceat((label < 0).astype(np.int32), leaves.first)
+        there = left >= _LEFT_POINTS
+        both = there[leaves.a] & there[leaves.b]
+        root = components(len(leaves), leaves.a[both], leaves.b[both])
+        size = np.bincount(root[there], left[there], minlength=len(leaves))
+        kept = there & (size[root] >= self.tolerance.points)
+        blocked = np.where(np.repeat(kept, leaves.count), label, 0).astype(np.int32)
+        samples = sample_leaves(self.grid, leaves, _REST, label=blocked)
+        part = root[samples.leaf]
+        order = np.argsort(part, kind="stable")
+        cut = np.flatnonzero(np.diff(part[order])) + 1
+        return samples, [s for s in np.split(order, cut) if len(s)]
+
+    def merge(self) -> bool:
+        """Merge surfaces that are one; say whether there were any."""
+        label = self.label[self.samples.index]
+        pairs, _ = contacts(self.leaves, self.own)
+        name, self.surfaces = merge_surfaces(
+            self.samples, label, self.surfaces, pairs, self.tolerance.noise
+        )
+        if np.array_equal(name, np.arange(len(name))):
+            return False
+        self.rename(name)
+        self.choose()
+        return True
+
+    def give_up(self) -> bool:
+        """Give up surfaces that their neighbours explain; say whether there were any."""
+        assert self.choice is not None
+        gone = explained_by_others(
+            self.label,
+            runtime.download(self.choice.second),
+            runtime.download(self.choice.off)[:, 1],
+            len(self.surfaces),
+            _EXPLAINED,
+        )
+        if not gone.any():
+            return False
+        name = np.where(gone, NONE, np.arange(len(gone)))
+        self.rename(name)
+        self.choose()
+        return True
+
+
+def find_surfaces(
+    grid: Grid, leaves: Leaves, group: np.ndarray, tolerance: Tolerance, rule: Rule
+) -> Surfaced:
+    """Find the analytic surfaces of a part, and the surface of every point.
+
+    Args:
+        grid: The sparse grid.
+        leaves: Its leaves.
+        group: Group of every leaf that the flood fill reached, -1 = none, shape (C,), i32.
+        tolerance: What counts as lying on a surface.
+        rule: What a point may differ from the surface that it takes.
+    """
+    search = _Search(grid, leaves, tolerance, rule)
+    samples = search.samples
+    part = group[samples.leaf]
+    size = np.bincount(group[group >= 0], leaves.count[group >= 0], minlength=1)
+    sets = [
+        s
+        for s in members_of(part, len(size))
+        if len(s) and size[part[s[0]]] >= tolerance.points
+    ]
+    for turn in range(_ROUNDS):
+        if not search.add(samples, sets) and turn > 0:
+            break
+        search.choose(passes=2)
+        search.refit()
+        search.choose()
+        samples, sets = search.rest()
+        if not sets:
+            break
+    for _ in range(_MERGES):
+        merged = search.merge()
+        if not search.give_up() and not merged:
+            break
+    return Surfaced(surfaces=search.surfaces, label=search.label, own=search.own)
+
+
+def number_pieces(leaves: Leaves, found: Surfaced, least: float) -> tuple[np.ndarray, np.ndarray]:
+    """Number the connected pieces of the surfaces by size.
+
+    Args:
+        leaves: The leaves.
+        found: The surfaces and their points.
+        least: A piece with fewer points is no patch.
+
+    Returns:
+        Patch of every sorted point, -1 = none, shape (n,), i32; and the surface of every patch.
+    """
+    piece = pieces(leaves, found.own, len(found.surfaces))
+    leaf = np.repeat(np.arange(len(leaves)), leaves.count)
+    there = found.label >= 0
+    cell, name = leaf[there], found.label[there]
+    rank = (found.own[cell] == name[:, None]).argmax(axis=1)
+    mine = piece[cell, rank]
+    size = np.bincount(mine)
+    names = np.flatnonzero(size >= max(least, 1))
+    names = names[np.argsort(-size[names], kind="stable")]
+    number = np.full(len(size), NONE, np.int32)
+    number[names] = np.arange(len(names), dtype=np.int32)
+    label = np.full(len(found.label), NONE, np.int32)
+    label[there] = number[mine]
+    surface = np.zeros(len(names), np.int32)
+    kept = label[there] >= 0
+    surface[label[there][kept]] = name[kept]
+    return label, surface
