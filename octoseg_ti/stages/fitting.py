@@ -5,6 +5,8 @@ on threads. All kinds share one set of seven unknowns: a shift of the surface (3
 tilt its axis, two numbers of its shape; a kind leaves out those that do not move it.
 """
 
+from typing import Any
+
 import numpy as np
 
 from octoseg_ti.device import runtime
@@ -35,10 +37,13 @@ FREE[TORUS] = True
 TUKEY = 4.685
 """Where the weight of a point ends, in standard deviations: 95 % efficient for normal noise."""
 
-_EXACT = 1e-26  # mean square of the distances, in extents, that is rounding
-_LEAVE = 4.0  # a kind that is so many times worse, in mean square, is not followed to its end
+_SOME = 100  # points that the first passes look at
+_PATIENCE = 3  # passes before a kind may be left
+_LEAVE = 4.0  # a kind that is so many times worse than another, in mean square, may be left
+_REST = 0.02  # the gain of a step, in variances of a point, that moves nothing worth telling
+_EXACT = 1e-26  # mean square distance, in extents, that is rounding
 _FAR = 1e4  # a surface that runs farther off, in extents, is left there
-_WORST = 1e9  # damping at which no step helps any more
+_DAMPING_START, _WORST = 1e-2, 1e9  # at the worst no step helps any more
 
 # Columns of the work of a task: two states (the best and the one on trial), each with its sum of
 # squares, gradient and normal equations (lower triangle by rows), then the damping and a factor.
@@ -76,13 +81,15 @@ def _triple(rows: ti.template(), i: ti.i32, at: ti.i32) -> vec3:
 
 @ti.func
 def _placed(kind: ti.i32, frame: ti.template(), g: ti.i32, work: ti.template(), t: ti.i32):
-    """Return (origin [mm], axis, a direction across it, shape, 1 / extent) of the trial state."""
+    """Return the state on trial: origin [mm], axis and two directions across [1/mm], shape."""
     scale = frame[g, 3]
     origin = row(frame, g) + _triple(work, t, _BLOCK) / scale
+    axis = scale * _triple(work, t, _BLOCK + 3)
+    u = _triple(work, t, _BLOCK + 6)
     shape = vec4(work[t, _BLOCK + 9], work[t, _BLOCK + 10], 0.0, 0.0)
     if kind == CONE:
         shape = cone_shape(shape[0], shape[1])
-    return origin, _triple(work, t, _BLOCK + 3), _triple(work, t, _BLOCK + 6), shape, scale
+    return origin, axis, scale * u, axis.cross(u), shape
 
 
 @ti.func
@@ -113,6 +120,7 @@ def _linearise(
     point_in: F64Rows,
     weight_in: F64Array,
     start_in: I32Array,
+    every_in: I32Array,
     frame_in: F64Rows,
     reach_in: F64Array,
     # Out:
@@ -126,14 +134,17 @@ def _linearise(
         if e % stride == 0 and work_inout[task_in[e // stride], _BLOCK + _COST] < 1e300:
             t = task_in[e // stride]
             kind = t % KINDS
-            origin, axis, u, shape, scale = _placed(kind, frame_in, t // KINDS, work_inout, t)
-            v = axis.cross(u)
+            g = t // KINDS
+            origin, axis, u, v, shape = _placed(kind, frame_in, g, work_inout, t)
             reach = reach_in[t]
+            first = start_in[g]
+            every = every_in[g]
             cost = 0.0
             gradient = vec7(0.0)
             normal = vec28(0.0)
-            for i in range(start_in[t // KINDS], start_in[t // KINDS + 1]):
-                p = (row(point_in, i) - origin) * scale
+            for k in range((start_in[g + 1] - first + every - 1) // every):
+                i = first + k * every
+                p = row(point_in, i) - origin
                 local = vec3(p.dot(u), p.dot(v), p.dot(axis))
                 d, j = _row_of(kind, local, shape)
                 w = weight_in[i]
@@ -167,8 +178,9 @@ def _solve_step(kind: ti.i32, damping: ti.f64, work: ti.template(), t: ti.i32):
             if a == b:
                 s = s * (1.0 + damping) + 1e-300
             for c in range(b):
-                s -= work[t, _FACTOR + a * (a + 1) // 2 + c] * (
-                    work[t, _FACTOR + b * (b + 1) // 2 + c]
+                s -= (
+                    work[t, _FACTOR + a * (a + 1) // 2 + c]
+                    * (work[t, _FACTOR + b * (b + 1) // 2 + c])
                 )
             if a == b:
                 # What no point holds is not moved.
@@ -225,7 +237,6 @@ def _try_step(kind: ti.i32, work: ti.template(), t: ti.i32):
 def _step(
     tasks: ti.i32,
     stride: ti.i32,
-    tolerance: ti.f64,
     # In:
     task_in: I32Array,
     # Out:
@@ -251,9 +262,61 @@ def _step(
                 gain = 0.0
             work_inout[t, _DAMPING] = damping
             work_inout[t, _GAIN] = gain
-            if gain > tolerance:
-                _solve_step(t % KINDS, damping, work_inout, t)
-                _try_step(t % KINDS, work_inout, t)
+            _solve_step(t % KINDS, damping, work_inout, t)
+            _try_step(t % KINDS, work_inout, t)
+
+
+def _contained(cost: np.ndarray) -> np.ndarray:
+    """Return the least cost of the simpler kinds that every kind can look like, (G, KINDS)."""
+    simpler = np.full_like(cost, np.inf)
+    simpler[:, [CYLINDER, SPHERE]] = cost[:, [PLANE]]
+    for kind in (CONE, TORUS):
+        simpler[:, kind] = cost[:, [PLANE, CYLINDER]].min(axis=1)
+    simpler[:, TORUS] = np.minimum(simpler[:, TORUS], cost[:, SPHERE])
+    return simpler
+
+
+class _Run:
+    """Fits under way: the work of every task, and which still move."""
+
+    def __init__(self, data: list[Any], state: np.ndarray, count: np.ndarray, robust: bool) -> None:
+        self.robust = robust
+        self.data, self.groups, self.count = data, len(count), count
+        self.work = np.zeros((self.groups * KINDS, _WORK))
+        self.work[:, :STATE] = state.reshape(-1, STATE)
+        self.going = np.repeat(count > 0, KINDS).reshape(-1, KINDS)
+
+    def improve(self, every: np.ndarray, rounds: int) -> None:
+        """Let what moves come to rest, seen by every so manieth point of its group."""
+        self.work[:, _BLOCK : _BLOCK + STATE] = self.work[:, :STATE]
+        self.work[:, _BLOCK + _COST] = 0.0
+        self.work[:, _COST] = np.where(self.going.ravel(), np.inf, self.work[:, _COST])
+        self.work[:, _DAMPING] = _DAMPING_START
+        going = self.going.copy()
+        device, stride = runtime.upload(self.work), runtime.workers()[1]
+        points, weight, start, frame, reach = self.data
+        data = points, weight, start, runtime.upload(every), frame, reach
+        seen = (-(-self.count // every))[:, None]
+        for k in range(rounds):
+            active = np.flatnonzero(going).astype(np.int32)
+            if len(active) == 0:
+                break
+            listed = runtime.upload(active)
+            _linearise(len(active), stride, listed, *data, device)
+            _step(len(active), stride, listed, device)
+            self.work = runtime.download(device)[: self.groups * KINDS]
+            shaped = self.work.reshape(self.groups, KINDS, _WORK)
+            cost, gain = shaped[..., _COST], shaped[..., _GAIN]
+            rest = (gain * seen <= _REST) | (cost <= _EXACT * seen)
+            if k >= _PATIENCE and not self.robust:
+                slow = gain < 0.1
+                worse = cost > _LEAVE * cost.min(axis=1, keepdims=True)
+                left = slow & (worse | (cost >= _contained(cost)))
+                left[:, PLANE] = False
+                self.going &= ~left
+                rest |= left
+            going &= ~rest
+            going[:, PLANE] &= self.robust  # else its start is the solution
 
 
 def iterate(
@@ -265,9 +328,11 @@ def iterate(
     state: np.ndarray,
     *,
     rounds: int,
-    tolerance: float = 1e-5,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:
     """Fit every kind to every group, from given states on.
+
+    First some hundred points of each group are fitted, then all of them. A kind that is far behind
+    another, or behind a simpler one that it contains, and gains little is left where it is.
 
     Args:
         points: Positions [mm], shape (S, 3), f64.
@@ -277,40 +342,28 @@ def iterate(
         reach: Distance at which the weight of a point ends, in extents, shape (G, KINDS);
             infinite = least squares.
         state: Where to start, shape (G, KINDS, STATE), as of `starts`.
-        rounds: Most passes over the points.
-        tolerance: Relative gain of a step at which to stop.
+        rounds: Most passes over the points, of either sort.
 
     Returns:
-        The states; their costs, shape (G, KINDS); and the normal equations J'WJ there, shape
-        (G, KINDS, UNKNOWNS, UNKNOWNS), zero where an unknown is not free.
+        The states; and the normal equations J'WJ there, shape (G, KINDS, UNKNOWNS, UNKNOWNS), zero
+        where an unknown is not free.
     """
     runtime.ensure_started()
-    groups = len(start) - 1
-    tasks = groups * KINDS
-    work = np.zeros((tasks, _WORK))
-    work[:, _BLOCK : _BLOCK + STATE] = state.reshape(tasks, STATE)
-    work[:, _COST] = np.inf
-    work[:, _DAMPING] = 1e-2
-    device, stride = runtime.upload(work), runtime.workers()[1]
-    data = [runtime.upload(a) for a in (points, weight, start, frame, reach.reshape(tasks))]
-    total = np.add.reduceat(np.append(weight, 0.0), start[:-1])[:, None]
-    going = np.repeat(np.diff(start) > 0, KINDS)
-    for k in range(rounds):
-        active = np.flatnonzero(going).astype(np.int32)
-        if len(active) == 0:
-            break
-        listed = runtime.upload(active)
-        _linearise(len(active), stride, listed, *data, device)
-        _step(len(active), stride, tolerance, listed, device)
-        work = runtime.download(device)[:tasks]
-        cost = work[:, _COST].reshape(groups, KINDS)
-        gain = work[:, _GAIN].reshape(groups, KINDS)
-        hopeless = (cost > _LEAVE * cost.min(axis=1, keepdims=True)) & (gain < 0.5)
-        going &= ~((gain <= tolerance) | (cost <= _EXACT * total) | (hopeless & (k > 3))).ravel()
-        going[PLANE::KINDS] = False  # its start is the solution
-    work = work.reshape(groups, KINDS, _WORK)
+    groups, count = len(start) - 1, np.diff(start)
+    flat = np.ascontiguousarray(reach.reshape(groups * KINDS))
+    run = _Run(
+        [runtime.upload(a) for a in (points, weight, start, frame, flat)],
+        state,
+        count,
+        bool(np.isfinite(flat).any()),
+    )
+    every = np.maximum(count // _SOME, 1).astype(np.int32)
+    if np.any(every > 1):
+        run.improve(every, rounds)
+    run.improve(np.ones(groups, np.int32), rounds)
+    work = run.work.reshape(groups, KINDS, _WORK)
     normal = np.zeros((groups, KINDS, UNKNOWNS, UNKNOWNS))
     a, b = np.tril_indices(UNKNOWNS)
     normal[..., a, b] = normal[..., b, a] = work[..., _NORMAL : _NORMAL + 28]
     normal *= FREE[None, :, :, None] & FREE[None, :, None, :]
-    return work[..., :STATE], work[..., _COST], normal
+    return work[..., :STATE], normal

@@ -14,7 +14,7 @@ from octoseg_ti.stages.starts import gather_moments, starts
 UNKNOWNS = FREE.sum(axis=1)
 """Degrees of freedom of every kind."""
 
-_ROUNDS = 30
+_ROUNDS = 12
 _SPREAD_BINS = 64  # quarters of a power of two, from the smallest spread that is told apart
 
 
@@ -137,7 +137,10 @@ def to_parameters(state: np.ndarray, centre: np.ndarray, extent: np.ndarray) -> 
 
 
 def _judged(
-    groups: int, samples: tuple[np.ndarray, ...], parameters: np.ndarray, least: np.ndarray,
+    groups: int,
+    samples: tuple[np.ndarray, ...],
+    parameters: np.ndarray,
+    least: np.ndarray,
     reach: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the sums of every group and kind, and the median absolute distance."""
@@ -202,19 +205,17 @@ def fit_all(
     samples = tuple(runtime.upload(a) for a in (points, normals, weight, start))
     held = points, weight, start, frame
     endless = np.full((groups, KINDS), np.inf)
-    never = np.zeros((groups, KINDS))
+    least = np.repeat(extent[:, None] / 2.0 ** (_SPREAD_BINS / 4), KINDS, axis=1)
     reach = endless
-    state, cost, normal = iterate(*held, reach, state, rounds=_ROUNDS)
+    state, normal = iterate(*held, reach, state, rounds=_ROUNDS)
     scale = np.broadcast_to(np.asarray(noise, np.float64), groups)[:, None]
-    total = np.maximum(m.weight, 1e-300)[:, None]
     for _ in range(3 if robust else 0):
-        least = np.maximum(np.sqrt(cost / total) * extent[:, None], 1e-12) / 2.0**12
         parameters = to_parameters(state, m.centre, extent)
         median = _judged(groups, samples, parameters, least, endless)[1]
         reach = TUKEY * np.maximum(1.4826 * median, scale)
-        state, _, normal = iterate(*held, reach / extent[:, None], state, rounds=_ROUNDS)
+        state, normal = iterate(*held, reach / extent[:, None], state, rounds=_ROUNDS)
     parameters = to_parameters(state, m.centre, extent)
-    sums = _judged(groups, samples, parameters, never, reach)[0]
+    sums = _judged(groups, samples, parameters, np.zeros((groups, KINDS)), reach)[0]
     return _fits(parameters, sums, normal, extent, np.diff(start))
 
 
