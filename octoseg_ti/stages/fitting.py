@@ -34,9 +34,6 @@ FREE[CONE, [0, 1, 3, 4, 5, 6]] = True
 FREE[SPHERE, [0, 1, 2, 5]] = True
 FREE[TORUS] = True
 
-TUKEY = 4.685
-"""Where the weight of a point ends, in standard deviations: 95 % efficient for normal noise."""
-
 _SOME = 100  # points that the first passes look at
 _PATIENCE = 3  # passes before a kind may be left
 _LEAVE = 4.0  # a kind that is so many times worse than another, in mean square, may be left
@@ -279,8 +276,10 @@ def _contained(cost: np.ndarray) -> np.ndarray:
 class _Run:
     """Fits under way: the work of every task, and which still move."""
 
-    def __init__(self, data: list[Any], state: np.ndarray, count: np.ndarray, robust: bool) -> None:
-        self.robust = robust
+    def __init__(
+        self, data: list[Any], state: np.ndarray, count: np.ndarray, robust: bool, all_kinds: bool
+    ) -> None:
+        self.robust, self.all_kinds = robust, all_kinds
         self.data, self.groups, self.count = data, len(count), count
         self.work = np.zeros((self.groups * KINDS, _WORK))
         self.work[:, :STATE] = state.reshape(-1, STATE)
@@ -308,7 +307,7 @@ class _Run:
             shaped = self.work.reshape(self.groups, KINDS, _WORK)
             cost, gain = shaped[..., _COST], shaped[..., _GAIN]
             rest = (gain * seen <= _REST) | (cost <= _EXACT * seen)
-            if k >= _PATIENCE and not self.robust:
+            if k >= _PATIENCE and not self.all_kinds:
                 slow = gain < 0.1
                 worse = cost > _LEAVE * cost.min(axis=1, keepdims=True)
                 left = slow & (worse | (cost >= _contained(cost)))
@@ -317,6 +316,18 @@ class _Run:
                 rest |= left
             going &= ~rest
             going[:, PLANE] &= self.robust  # else its start is the solution
+
+
+def moved(state: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Return states after a step in the seven unknowns, shapes (..., STATE) and (..., 7)."""
+    point, axis, u = state[..., :3], state[..., 3:6], state[..., 6:9]
+    v = np.cross(axis, u)
+    point = point + step[..., 0, None] * u + step[..., 1, None] * v + step[..., 2, None] * axis
+    axis = axis + step[..., 4, None] * u - step[..., 3, None] * v
+    axis = axis / np.linalg.norm(axis, axis=-1, keepdims=True)
+    u = u - np.sum(u * axis, axis=-1, keepdims=True) * axis
+    u = u / np.linalg.norm(u, axis=-1, keepdims=True)
+    return np.concatenate((point, axis, u, state[..., 9:] + step[..., 5:]), axis=-1)
 
 
 def iterate(
@@ -328,6 +339,7 @@ def iterate(
     state: np.ndarray,
     *,
     rounds: int,
+    all_kinds: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit every kind to every group, from given states on.
 
@@ -343,6 +355,7 @@ def iterate(
             infinite = least squares.
         state: Where to start, shape (G, KINDS, STATE), as of `starts`.
         rounds: Most passes over the points, of either sort.
+        all_kinds: Leave none; what a robust fit needs, as outliers can favour the wrong kind.
 
     Returns:
         The states; and the normal equations J'WJ there, shape (G, KINDS, UNKNOWNS, UNKNOWNS), zero
@@ -351,12 +364,8 @@ def iterate(
     runtime.ensure_started()
     groups, count = len(start) - 1, np.diff(start)
     flat = np.ascontiguousarray(reach.reshape(groups * KINDS))
-    run = _Run(
-        [runtime.upload(a) for a in (points, weight, start, frame, flat)],
-        state,
-        count,
-        bool(np.isfinite(flat).any()),
-    )
+    data = [runtime.upload(a) for a in (points, weight, start, frame, flat)]
+    run = _Run(data, state, count, bool(np.isfinite(flat).any()), all_kinds)
     every = np.maximum(count // _SOME, 1).astype(np.int32)
     if np.any(every > 1):
         run.improve(every, rounds)
