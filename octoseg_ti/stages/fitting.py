@@ -5,10 +5,12 @@ on threads. All kinds share one set of seven unknowns: a shift of the surface (3
 tilt its axis, two numbers of its shape; a kind leaves out those that do not move it.
 """
 
+from typing import Any
+
 import numpy as np
 
 from octoseg_ti.device import runtime
-from octoseg_ti.device.linalg import row, vec2, vec3
+from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, ti
 from octoseg_ti.device.surfaces import (
     CONE,
@@ -32,11 +34,13 @@ FREE[CONE, [0, 1, 3, 4, 5, 6]] = True
 FREE[SPHERE, [0, 1, 2, 5]] = True
 FREE[TORUS] = True
 
-TUKEY = 4.685
-"""Where the weight of a point ends, in standard deviations: 95 % efficient for normal noise."""
-
+_SOME = 100  # points that the first passes look at
+_PATIENCE = 3  # passes before a kind may be left
+_LEAVE = 4.0  # a kind that is so many times worse than another, in mean square, may be left
+_REST = 0.02  # the gain of a step, in variances of a point, that moves nothing worth telling
+_EXACT = 1e-26  # mean square distance, in extents, that is rounding
 _FAR = 1e4  # a surface that runs farther off, in extents, is left there
-_WORST = 1e9  # damping at which no step helps any more
+_DAMPING_START, _WORST = 1e-2, 1e9  # at the worst no step helps any more
 
 # Columns of the work of a task: two states (the best and the one on trial), each with its sum of
 # squares, gradient and normal equations (lower triangle by rows), then the damping and a factor.
@@ -44,7 +48,8 @@ _COST, _GRADIENT, _NORMAL = STATE, STATE + 1, STATE + 1 + UNKNOWNS
 _BLOCK = _NORMAL + 28
 _FACTOR = 2 * _BLOCK
 _STEP = _FACTOR + 28
-WORK = _STEP + UNKNOWNS
+_DAMPING, _GAIN = _STEP + UNKNOWNS, _STEP + UNKNOWNS + 1
+_WORK = _GAIN + 1
 
 vec7 = ti.types.vector(7, ti.f64)
 vec28 = ti.types.vector(28, ti.f64)
@@ -66,75 +71,96 @@ def _free(kind: ti.i32, k: ti.i32) -> ti.i32:
 
 
 @ti.func
-def _linearise(
-    kind: ti.i32,
-    g: ti.i32,
-    reach: ti.f64,
-    point: ti.template(),
-    weight: ti.template(),
-    start: ti.template(),
-    frame: ti.template(),
-    work: ti.template(),
-    t: ti.i32,
-    at: ti.i32,
-):
-    """Write cost, gradient and normal equations of the state in column ``at``.
+def _triple(rows: ti.template(), i: ti.i32, at: ti.i32) -> vec3:
+    """Return three numbers of row ``i`` from column ``at`` on."""
+    return vec3(rows[i, at], rows[i, at + 1], rows[i, at + 2])
 
-    ``reach`` is where the weight of a point ends (Tukey's biweight); infinite = least squares.
-    """
-    origin = vec3(work[t, at], work[t, at + 1], work[t, at + 2])
-    axis = vec3(work[t, at + 3], work[t, at + 4], work[t, at + 5])
-    u = vec3(work[t, at + 6], work[t, at + 7], work[t, at + 8])
-    v = axis.cross(u)
-    shape = vec4(work[t, at + 9], work[t, at + 10], 0.0, 0.0)
+
+@ti.func
+def _placed(kind: ti.i32, frame: ti.template(), g: ti.i32, work: ti.template(), t: ti.i32):
+    """Return the state on trial: origin [mm], axis and two directions across [1/mm], shape."""
+    scale = frame[g, 3]
+    origin = row(frame, g) + _triple(work, t, _BLOCK) / scale
+    axis = scale * _triple(work, t, _BLOCK + 3)
+    u = _triple(work, t, _BLOCK + 6)
+    shape = vec4(work[t, _BLOCK + 9], work[t, _BLOCK + 10], 0.0, 0.0)
     if kind == CONE:
         shape = cone_shape(shape[0], shape[1])
-    centre = row(frame, g)
-    scale = frame[g, 3]
-    cost = 0.0
-    gradient = vec7(0.0)
-    normal = vec28(0.0)
-    for i in range(start[g], start[g + 1]):
-        p = (row(point, i) - centre) * scale - origin
-        x = p.dot(u)
-        y = p.dot(v)
-        z = p.dot(axis)
-        rho = ti.sqrt(x * x + y * y)
-        f = profile(kind, rho, z, shape)
-        c = f[1] / ti.max(rho, 1e-12)
-        by_shape = vec2(-1.0, -1.0)
-        if kind == CONE:
-            by_shape = vec2(-rho * shape[3] - z * shape[2], -1.0)
-        elif kind == TORUS:
-            by_shape = vec2(-f[1], -1.0)
-        j = vec7(
-            -c * x,
-            -c * y,
-            -f[2],
-            c * y * z - y * f[2],
-            x * f[2] - c * x * z,
-            by_shape[0],
-            by_shape[1],
-        )
-        w = weight[i]
-        square = f[0] * f[0]
-        if reach < 1e300:
-            left = ti.max(1.0 - square / (reach * reach), 0.0)
-            cost += w * reach * reach * (1.0 - left * left * left) / 3.0
-            w *= left * left
-        else:
-            cost += w * square
-        wd = w * f[0]
-        gradient += wd * j
-        for a in ti.static(range(7)):
-            wj = w * j[a]
-            for b in ti.static(range(a + 1)):
-                normal[a * (a + 1) // 2 + b] += wj * j[b]
-    work[t, at + _COST] = cost
-    for a in ti.static(range(7)):
-        work[t, at + _GRADIENT + a] = gradient[a]
-    for a in ti.static(range(28)):
-        work[t, at + _NORMAL + a] = normal[a]
+    return origin, axis, scale * u, axis.cross(u), shape
+
+
+@ti.func
+def _row_of(kind: ti.i32, q: vec3, shape: vec4):
+    """Return the distance of a point in the surface's own frame and its change by the unknowns.
+
+    A surface that is shifted by s and turned by r moves away by n.s + r.(q x n).
+    """
+    rho = ti.sqrt(q[0] * q[0] + q[1] * q[1])
+    f = profile(kind, rho, q[2], shape)
+    c = f[1] / ti.max(rho, 1e-12)
+    by_a = -1.0
+    if kind == CONE:
+        by_a = -rho * shape[3] - q[2] * shape[2]
+    elif kind == TORUS:
+        by_a = -f[1]
+    n = vec3(c * q[0], c * q[1], f[2])
+    turned = q.cross(n)
+    return f[0], vec7(-n[0], -n[1], -n[2], -turned[0], -turned[1], by_a, -1.0)
+
+
+@ti.kernel
+def _linearise(
+    tasks: ti.i32,
+    stride: ti.i32,
+    # In:
+    task_in: I32Array,
+    point_in: F64Rows,
+    weight_in: F64Array,
+    start_in: I32Array,
+    every_in: I32Array,
+    frame_in: F64Rows,
+    reach_in: F64Array,
+    # Out:
+    work_inout: F64Rows,
+):
+    """Write cost, gradient and normal equations of the state on trial of every task listed.
+
+    The reach is where the weight of a point ends (Tukey's biweight); infinite = least squares.
+    """
+    for e in range(tasks * stride):
+        if e % stride == 0 and work_inout[task_in[e // stride], _BLOCK + _COST] < 1e300:
+            t = task_in[e // stride]
+            kind = t % KINDS
+            g = t // KINDS
+            origin, axis, u, v, shape = _placed(kind, frame_in, g, work_inout, t)
+            reach = reach_in[t]
+            first = start_in[g]
+            every = every_in[g]
+            cost = 0.0
+            gradient = vec7(0.0)
+            normal = vec28(0.0)
+            for k in range((start_in[g + 1] - first + every - 1) // every):
+                i = first + k * every
+                p = row(point_in, i) - origin
+                local = vec3(p.dot(u), p.dot(v), p.dot(axis))
+                d, j = _row_of(kind, local, shape)
+                w = weight_in[i]
+                if reach < 1e300:
+                    left = ti.max(1.0 - d * d / (reach * reach), 0.0)
+                    cost += w * reach * reach * (1.0 - left * left * left) / 3.0
+                    w *= left * left
+                else:
+                    cost += w * d * d
+                gradient += (w * d) * j
+                for a in ti.static(range(7)):
+                    wj = w * j[a]
+                    for b in ti.static(range(a + 1)):
+                        normal[a * (a + 1) // 2 + b] += wj * j[b]
+            work_inout[t, _BLOCK + _COST] = cost
+            for a in ti.static(range(7)):
+                work_inout[t, _BLOCK + _GRADIENT + a] = gradient[a]
+            for a in ti.static(range(28)):
+                work_inout[t, _BLOCK + _NORMAL + a] = normal[a]
 
 
 @ti.func
@@ -149,8 +175,9 @@ def _solve_step(kind: ti.i32, damping: ti.f64, work: ti.template(), t: ti.i32):
             if a == b:
                 s = s * (1.0 + damping) + 1e-300
             for c in range(b):
-                s -= work[t, _FACTOR + a * (a + 1) // 2 + c] * (
-                    work[t, _FACTOR + b * (b + 1) // 2 + c]
+                s -= (
+                    work[t, _FACTOR + a * (a + 1) // 2 + c]
+                    * (work[t, _FACTOR + b * (b + 1) // 2 + c])
                 )
             if a == b:
                 # What no point holds is not moved.
@@ -177,100 +204,130 @@ def _solve_step(kind: ti.i32, damping: ti.f64, work: ti.template(), t: ti.i32):
 
 
 @ti.func
-def _try_step(work: ti.template(), t: ti.i32):
-    """Write the state that the step leads to, on trial."""
-    origin = row_at(work, t, 0)
-    axis = row_at(work, t, 3)
-    u = row_at(work, t, 6)
+def _try_step(kind: ti.i32, work: ti.template(), t: ti.i32):
+    """Write the state that the step leads to, on trial; of infinite cost where it is none."""
+    origin = _triple(work, t, 0)
+    axis = _triple(work, t, 3)
+    u = _triple(work, t, 6)
     v = axis.cross(u)
-    step = row_at(work, t, _STEP)
+    step = _triple(work, t, _STEP)
     origin += step[0] * u + step[1] * v + step[2] * axis
     axis = (axis + work[t, _STEP + 4] * u - work[t, _STEP + 3] * v).normalized()
     u = (u - axis.dot(u) * axis).normalized()
+    a = work[t, 9] + work[t, _STEP + 5]
+    b = work[t, 10] + work[t, _STEP + 6]
     for k in ti.static(range(3)):
         work[t, _BLOCK + k] = origin[k]
         work[t, _BLOCK + 3 + k] = axis[k]
         work[t, _BLOCK + 6 + k] = u[k]
-    work[t, _BLOCK + 9] = work[t, 9] + work[t, _STEP + 5]
-    work[t, _BLOCK + 10] = work[t, 10] + work[t, _STEP + 6]
-
-
-@ti.func
-def row_at(rows: ti.template(), i: ti.i32, at: ti.i32) -> vec3:
-    """Return three numbers of row ``i`` from column ``at`` on."""
-    return vec3(rows[i, at], rows[i, at + 1], rows[i, at + 2])
-
-
-@ti.func
-def _possible(kind: ti.i32, work: ti.template(), t: ti.i32) -> ti.i32:
-    """Return 1 if the state on trial is a surface, and not farther off than any is followed."""
-    ok = 1
-    if row_at(work, t, _BLOCK).norm() > _FAR or not (ti.abs(work[t, _BLOCK + 9]) < _FAR):
-        ok = 0
-    if kind != CONE and (work[t, _BLOCK + 9] < 0.0 or work[t, _BLOCK + 10] < 0.0):
-        ok = 0
-    return ok
+    work[t, _BLOCK + 9] = a
+    work[t, _BLOCK + 10] = b
+    possible = origin.norm() <= _FAR and ti.abs(a) <= _FAR
+    if kind != CONE and (a < 0.0 or b < 0.0):
+        possible = False
+    work[t, _BLOCK + _COST] = 0.0
+    if not possible:
+        work[t, _BLOCK + _COST] = ti.math.inf
 
 
 @ti.kernel
-def _iterate(
+def _step(
     tasks: ti.i32,
     stride: ti.i32,
-    rounds: ti.i32,
-    tolerance: ti.f64,
     # In:
-    point_in: F64Rows,
-    weight_in: F64Array,
-    start_in: I32Array,
-    frame_in: F64Rows,
-    reach_in: F64Array,
+    task_in: I32Array,
     # Out:
     work_inout: F64Rows,
 ):
-    """Improve the best state of every task until steps gain too little or the rounds are over."""
-    for u in range(tasks * stride):
-        if u % stride == 0 and start_in[u // stride // KINDS + 1] > start_in[u // stride // KINDS]:
-            t = u // stride
-            g = t // KINDS
-            kind = t % KINDS
-            damping = 1e-3
-            at = 0  # the first round measures the start itself
-            k = 0
-            while k < rounds:
-                k += 1
-                fits = 1
-                if at > 0:
-                    fits = _possible(kind, work_inout, t)
-                if fits == 1:
-                    _linearise(
-                        kind,
-                        g,
-                        reach_in[t],
-                        point_in,
-                        weight_in,
-                        start_in,
-                        frame_in,
-                        work_inout,
-                        t,
-                        at,
-                    )
-                gain = 1.0
-                if at > 0:
-                    before = work_inout[t, _COST]
-                    after = work_inout[t, _BLOCK + _COST]
-                    if fits == 1 and after <= before:
-                        for c in range(_BLOCK):
-                            work_inout[t, c] = work_inout[t, _BLOCK + c]
-                        damping = ti.max(0.1 * damping, 1e-12)
-                        gain = (before - after) / ti.max(before, 1e-300)
-                    else:
-                        damping = damping * 10.0
-                if gain <= tolerance or damping > _WORST:
-                    k = rounds
-                else:
-                    _solve_step(kind, damping, work_inout, t)
-                    _try_step(work_inout, t)
-                    at = _BLOCK
+    """Keep the state on trial if it is better, and step on from the best; note what it gained."""
+    for e in range(tasks * stride):
+        if e % stride == 0:
+            t = task_in[e // stride]
+            before = work_inout[t, _COST]
+            after = work_inout[t, _BLOCK + _COST]
+            damping = work_inout[t, _DAMPING]
+            gain = 1.0
+            if after <= before:
+                for c in range(_BLOCK):
+                    work_inout[t, c] = work_inout[t, _BLOCK + c]
+                damping = ti.max(0.1 * damping, 1e-12)
+                if before < 1e300:
+                    gain = (before - after) / ti.max(before, 1e-300)
+            else:
+                damping *= 10.0
+            if damping > _WORST:
+                gain = 0.0
+            work_inout[t, _DAMPING] = damping
+            work_inout[t, _GAIN] = gain
+            _solve_step(t % KINDS, damping, work_inout, t)
+            _try_step(t % KINDS, work_inout, t)
+
+
+def _contained(cost: np.ndarray) -> np.ndarray:
+    """Return the least cost of the simpler kinds that every kind can look like, (G, KINDS)."""
+    simpler = np.full_like(cost, np.inf)
+    simpler[:, [CYLINDER, SPHERE]] = cost[:, [PLANE]]
+    for kind in (CONE, TORUS):
+        simpler[:, kind] = cost[:, [PLANE, CYLINDER]].min(axis=1)
+    simpler[:, TORUS] = np.minimum(simpler[:, TORUS], cost[:, SPHERE])
+    return simpler
+
+
+class _Run:
+    """Fits under way: the work of every task, and which still move."""
+
+    def __init__(
+        self, data: list[Any], state: np.ndarray, count: np.ndarray, robust: bool, all_kinds: bool
+    ) -> None:
+        self.robust, self.all_kinds = robust, all_kinds
+        self.data, self.groups, self.count = data, len(count), count
+        self.work = np.zeros((self.groups * KINDS, _WORK))
+        self.work[:, :STATE] = state.reshape(-1, STATE)
+        self.going = np.repeat(count > 0, KINDS).reshape(-1, KINDS)
+
+    def improve(self, every: np.ndarray, rounds: int) -> None:
+        """Let what moves come to rest, seen by every so manieth point of its group."""
+        self.work[:, _BLOCK : _BLOCK + STATE] = self.work[:, :STATE]
+        self.work[:, _BLOCK + _COST] = 0.0
+        self.work[:, _COST] = np.where(self.going.ravel(), np.inf, self.work[:, _COST])
+        self.work[:, _DAMPING] = _DAMPING_START
+        going = self.going.copy()
+        device, stride = runtime.upload(self.work), runtime.workers()[1]
+        points, weight, start, frame, reach = self.data
+        data = points, weight, start, runtime.upload(every), frame, reach
+        seen = (-(-self.count // every))[:, None]
+        for k in range(rounds):
+            active = np.flatnonzero(going).astype(np.int32)
+            if len(active) == 0:
+                break
+            listed = runtime.upload(active)
+            _linearise(len(active), stride, listed, *data, device)
+            _step(len(active), stride, listed, device)
+            self.work = runtime.download(device)[: self.groups * KINDS]
+            shaped = self.work.reshape(self.groups, KINDS, _WORK)
+            cost, gain = shaped[..., _COST], shaped[..., _GAIN]
+            rest = (gain * seen <= _REST) | (cost <= _EXACT * seen)
+            if k >= _PATIENCE and not self.all_kinds:
+                slow = gain < 0.1
+                worse = cost > _LEAVE * cost.min(axis=1, keepdims=True)
+                left = slow & (worse | (cost >= _contained(cost)))
+                left[:, PLANE] = False
+                self.going &= ~left
+                rest |= left
+            going &= ~rest
+            going[:, PLANE] &= self.robust  # else its start is the solution
+
+
+def moved(state: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Return states after a step in the seven unknowns, shapes (..., STATE) and (..., 7)."""
+    point, axis, u = state[..., :3], state[..., 3:6], state[..., 6:9]
+    v = np.cross(axis, u)
+    point = point + step[..., 0, None] * u + step[..., 1, None] * v + step[..., 2, None] * axis
+    axis = axis + step[..., 4, None] * u - step[..., 3, None] * v
+    axis = axis / np.linalg.norm(axis, axis=-1, keepdims=True)
+    u = u - np.sum(u * axis, axis=-1, keepdims=True) * axis
+    u = u / np.linalg.norm(u, axis=-1, keepdims=True)
+    return np.concatenate((point, axis, u, state[..., 9:] + step[..., 5:]), axis=-1)
 
 
 def iterate(
@@ -282,9 +339,12 @@ def iterate(
     state: np.ndarray,
     *,
     rounds: int,
-    tolerance: float = 1e-7,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    all_kinds: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
     """Fit every kind to every group, from given states on.
+
+    First some hundred points of each group are fitted, then all of them. A kind that is far behind
+    another, or behind a simpler one that it contains, and gains little is left where it is.
 
     Args:
         points: Positions [mm], shape (S, 3), f64.
@@ -294,34 +354,25 @@ def iterate(
         reach: Distance at which the weight of a point ends, in extents, shape (G, KINDS);
             infinite = least squares.
         state: Where to start, shape (G, KINDS, STATE), as of `starts`.
-        rounds: Most passes over the points.
-        tolerance: Relative gain of a step at which to stop.
+        rounds: Most passes over the points, of either sort.
+        all_kinds: Leave none; what a robust fit needs, as outliers can favour the wrong kind.
 
     Returns:
-        The states; their costs, shape (G, KINDS); and the normal equations J'WJ there, shape
-        (G, KINDS, UNKNOWNS, UNKNOWNS), zero where an unknown is not free.
+        The states; and the normal equations J'WJ there, shape (G, KINDS, UNKNOWNS, UNKNOWNS), zero
+        where an unknown is not free.
     """
     runtime.ensure_started()
-    groups = len(start) - 1
-    tasks = groups * KINDS
-    work = np.zeros((tasks, WORK))
-    work[:, :STATE] = state.reshape(tasks, STATE)
-    device = runtime.upload(work)
-    _iterate(
-        tasks,
-        runtime.workers()[1],
-        rounds,
-        tolerance,
-        runtime.upload(points),
-        runtime.upload(weight),
-        runtime.upload(start),
-        runtime.upload(frame),
-        runtime.upload(reach.reshape(tasks)),
-        device,
-    )
-    work = runtime.download(device)[:tasks].reshape(groups, KINDS, WORK)
+    groups, count = len(start) - 1, np.diff(start)
+    flat = np.ascontiguousarray(reach.reshape(groups * KINDS))
+    data = [runtime.upload(a) for a in (points, weight, start, frame, flat)]
+    run = _Run(data, state, count, bool(np.isfinite(flat).any()), all_kinds)
+    every = np.maximum(count // _SOME, 1).astype(np.int32)
+    if np.any(every > 1):
+        run.improve(every, rounds)
+    run.improve(np.ones(groups, np.int32), rounds)
+    work = run.work.reshape(groups, KINDS, _WORK)
     normal = np.zeros((groups, KINDS, UNKNOWNS, UNKNOWNS))
     a, b = np.tril_indices(UNKNOWNS)
     normal[..., a, b] = normal[..., b, a] = work[..., _NORMAL : _NORMAL + 28]
     normal *= FREE[None, :, :, None] & FREE[None, :, None, :]
-    return work[..., :STATE], work[..., _COST], normal
+    return work[..., :STATE], normal

@@ -8,14 +8,20 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, ti
 from octoseg_ti.device.surfaces import CONE, CYLINDER, KINDS, SPHERE, TORUS, surface_at
-from octoseg_ti.stages.fitting import FREE, TUKEY, iterate
+from octoseg_ti.stages.fitting import FREE, iterate, moved
 from octoseg_ti.stages.starts import gather_moments, starts
 
-UNKNOWNS = FREE.sum(axis=1)
+FREEDOM = FREE.sum(axis=1)
 """Degrees of freedom of every kind."""
 
-_ROUNDS = 30
-_SPREAD_BINS = 64  # quarters of a power of two, from the smallest spread that is told apart
+TUKEY = 4.685
+"""Where the weight of a point ends, in standard deviations: 95 % efficient for normal noise
+(Holland & Welsch 1977)."""
+
+_ROUNDS = 12
+_BINS = 64  # of distances: quarters of a power of two, up to the extent of the group
+_NARROWED = 2  # times that every surface takes its own spread for scale, before they share one
+_SUMS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -23,9 +29,13 @@ class Fits:
     """Surfaces of every kind through ``G`` groups; NaN where a group has too few points for one."""
 
     parameters: np.ndarray
-    """As in `Segmentation.parameters`, shape (G, 5, 8), f64, by `SurfaceKind`."""
+    """As in `Segmentation.parameters`, shape (G, 5, 8), f64, by `SurfaceKind`. The axis of a sphere
+    means nothing."""
     rms: np.ndarray
-    """Root mean square orthogonal distance [mm], shape (G, 5), of the points that count."""
+    """Root mean square orthogonal distance [mm], shape (G, 5); of a robust fit, weighted."""
+    loss: np.ndarray
+    """Mean of what the fit makes least [mm^2], shape (G, 5): the square of a distance; of a robust
+    fit, one that grows no more for points out of reach. The kinds of a group can be compared."""
     tilt: np.ndarray
     """Root mean square sine between measured and surface normals, shape (G, 5)."""
     side: np.ndarray
@@ -34,10 +44,16 @@ class Fits:
     inside: np.ndarray
     """Share of the weight that is within reach of the surface, shape (G, 5); 1 for least
     squares."""
-    normal: np.ndarray
-    """J'WJ at the solution, for its shift [mm], tilt and shape, shape (G, 5, 7, 7)."""
     count: np.ndarray
-    """Points with weight, shape (G,)."""
+    """Samples, shape (G,)."""
+    extent: np.ndarray
+    """Root mean square distance of the samples from their centre [mm], shape (G,)."""
+    centre: np.ndarray
+    """Centre of the samples [mm], shape (G, 3)."""
+    state: np.ndarray
+    """The surfaces in units of the extent about the centre, shape (G, 5, STATE)."""
+    normal: np.ndarray
+    """J'WJ there, in these units, shape (G, 5, 7, 7); see `covariance`."""
 
 
 @ti.kernel
@@ -52,26 +68,64 @@ def _judge(
     parameters_in: F64Rows,
     reach_in: F64Array,
     # Out:
-    bin_inout: I32Array,
     sum_out: F64Rows,
 ):
-    """Sum weights, squares of distances, sines and cosines of normals; bin the distances."""
-    for u in range(tasks * stride):
-        if u % stride == 0:
-            t = u // stride
-            g = t // KINDS
+    """Sum weights, losses, squares of distances, and cosines of normals over every group."""
+    for e in range(tasks * stride):
+        if e % stride == 0:
+            t = e // stride
             origin = row(parameters_in, t)
             axis = vec3(parameters_in[t, 3], parameters_in[t, 4], parameters_in[t, 5])
-            least = parameters_in[t, 8]
-            total = 0.0
-            within = 0.0
-            square = 0.0
+            a = parameters_in[t, 6]
+            b = parameters_in[t, 7]
+            reach = reach_in[t]
+            weights = vec3(0.0, 0.0, 0.0)
+            squares = vec3(0.0, 0.0, 0.0)
             signed = 0.0
-            cosine = 0.0
-            counted = 0.0
             size = 0.0
-            for i in range(start_in[g], start_in[g + 1]):
-                d, n = surface_at(
+            for i in range(start_in[t // KINDS], start_in[t // KINDS + 1]):
+                d, n = surface_at(t % KINDS, row(point_in, i), origin, axis, a, b)
+                w = weight_in[i]
+                left = 1.0
+                loss = d * d
+                if reach < 1e300:
+                    left = ti.max(1.0 - loss / (reach * reach), 0.0)
+                    loss = reach * reach * (1.0 - left * left * left) / 3.0
+                m = row(normal_in, i)
+                c = m.dot(n)
+                v = w * left * left
+                weights += vec3(w, ti.select(left > 0.0, w, 0.0), v)
+                squares += vec3(w * loss, v * d * d, v * c * c)
+                signed += v * c
+                size += v * m.norm_sqr()
+            for k in ti.static(range(3)):
+                sum_out[t, k] = weights[k]
+                sum_out[t, 3 + k] = squares[k]
+            sum_out[t, 6] = signed
+            sum_out[t, 7] = size
+
+
+@ti.kernel
+def _count_distances(
+    tasks: ti.i32,
+    stride: ti.i32,
+    # In:
+    point_in: F64Rows,
+    weight_in: F64Array,
+    start_in: I32Array,
+    parameters_in: F64Rows,
+    least_in: F64Array,
+    # Out:
+    bin_inout: I32Array,
+):
+    """Count the points of every group by the logarithm of their distance."""
+    for e in range(tasks * stride):
+        if e % stride == 0:
+            t = e // stride
+            origin = row(parameters_in, t)
+            axis = vec3(parameters_in[t, 3], parameters_in[t, 4], parameters_in[t, 5])
+            for i in range(start_in[t // KINDS], start_in[t // KINDS + 1]):
+                d, _ = surface_at(
                     t % KINDS,
                     row(point_in, i),
                     origin,
@@ -79,30 +133,13 @@ def _judge(
                     parameters_in[t, 6],
                     parameters_in[t, 7],
                 )
-                w = weight_in[i]
-                total += w
-                left = ti.max(1.0 - (d / reach_in[t]) ** 2, 0.0)
-                if left > 0.0:
-                    within += w
-                w *= left * left
-                counted += w
-                square += w * d * d
-                m = row(normal_in, i)
-                c = m.dot(n)
-                signed += w * c
-                cosine += w * c * c
-                size += w * m.norm_sqr()
-                if least > 0.0 and weight_in[i] > 0.0:
-                    k = ti.cast(4.0 * ti.log(ti.max(ti.abs(d) / least, 1.0)) / ti.log(2.0), ti.i32)
-                    k = t * _SPREAD_BINS + ti.min(ti.max(k, 0), _SPREAD_BINS - 1)
+                ratio = ti.abs(d) / least_in[t // KINDS]
+                if weight_in[i] > 0.0:
+                    k = 0
+                    if ratio > 1.0:
+                        k = ti.min(ti.cast(4.0 * ti.log(ratio) / ti.log(2.0), ti.i32), _BINS - 1)
+                    k += t * _BINS
                     bin_inout[k] = bin_inout[k] + 1
-            sum_out[t, 0] = total
-            sum_out[t, 1] = within
-            sum_out[t, 2] = square
-            sum_out[t, 3] = signed
-            sum_out[t, 4] = cosine
-            sum_out[t, 5] = counted
-            sum_out[t, 6] = size
 
 
 def to_parameters(state: np.ndarray, centre: np.ndarray, extent: np.ndarray) -> np.ndarray:
@@ -119,49 +156,71 @@ def to_parameters(state: np.ndarray, centre: np.ndarray, extent: np.ndarray) -> 
     parameters = np.full((*state.shape[:2], 8), np.nan)
     e = extent[:, None]
     point, axis = state[..., :3].copy(), state[..., 3:6].copy()
-    # The line of a cone with its normal away from the axis and the axis out of the apex.
+    # The line of a cone with its normal away from the axis, and the axis out of the apex.
     h, s = state[:, CONE, 9], state[:, CONE, 10]
     cosine, sine = np.cos(h), np.sin(h)
     side = np.where(cosine < 0.0, -1.0, 1.0)
     sine, s = sine * side, s * side
-    axis[:, CONE] *= np.where(sine < 0.0, -1.0, 1.0)[:, None]
+    opens = np.where(sine < 0.0, -1.0, 1.0)
+    axis[:, CONE] *= opens[:, None]
     sine = np.maximum(np.abs(sine), 1e-6)
     point[:, CONE] -= (s / sine)[:, None] * axis[:, CONE]
     parameters[..., :3] = centre[:, None, :] + e[..., None] * point
     parameters[..., 3:6] = axis
     parameters[:, CONE, 6] = np.arctan2(sine, np.abs(cosine))
     for kind in (CYLINDER, SPHERE, TORUS):
-        parameters[:, kind, 6] = e[:, 0] * state[:, kind, 9]
-    parameters[:, TORUS, 7] = e[:, 0] * state[:, TORUS, 10]
+        parameters[:, kind, 6] = extent * state[:, kind, 9]
+    parameters[:, TORUS, 7] = extent * state[:, TORUS, 10]
     return parameters
 
 
-def _judged(
-    groups: int, samples: tuple[np.ndarray, ...], parameters: np.ndarray, least: np.ndarray,
-    reach: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sums of every group and kind, and the median absolute distance."""
-    tasks = groups * KINDS
-    models = np.column_stack((parameters.reshape(tasks, 8), least.reshape(tasks)))
-    bins = runtime.zeros(tasks * _SPREAD_BINS, np.int32)
-    sums = runtime.empty((tasks, 7), np.float64)
-    points, normals, weight, start = samples
-    _judge(
-        tasks,
-        runtime.workers()[1],
-        points,
-        normals,
-        weight,
-        start,
-        runtime.upload(models),
-        runtime.upload(reach.reshape(tasks)),
-        bins,
-        sums,
-    )
-    below = np.cumsum(runtime.download(bins).reshape(tasks, _SPREAD_BINS), axis=1)
-    half = np.argmax(2 * below >= below[:, -1:], axis=1).reshape(groups, KINDS)
-    median = least * 2.0 ** ((half + 0.5) / 4.0)
-    return runtime.download(sums)[:tasks].reshape(groups, KINDS, 7), median
+class _Samples:
+    """The samples of all groups, ready for kernels."""
+
+    def __init__(
+        self, points: np.ndarray, normals: np.ndarray, weight: np.ndarray, start: np.ndarray
+    ) -> None:
+        self.groups = len(start) - 1
+        self.points, self.normals = runtime.upload(points), runtime.upload(normals)
+        self.weight, self.start = runtime.upload(weight), runtime.upload(start)
+
+    def spread(self, parameters: np.ndarray, extent: np.ndarray) -> np.ndarray:
+        """Return the median absolute distance as a standard deviation [mm], to a tenth, (G, 5)."""
+        tasks = self.groups * KINDS
+        bins = runtime.zeros(tasks * _BINS, np.int32)
+        least = extent / 2.0 ** (_BINS / 4)
+        models = runtime.upload(parameters.reshape(tasks, 8))
+        _count_distances(
+            tasks,
+            runtime.workers()[1],
+            self.points,
+            self.weight,
+            self.start,
+            models,
+            runtime.upload(least),
+            bins,
+        )
+        counts = runtime.download(bins)[: tasks * _BINS].reshape(self.groups, KINDS, _BINS)
+        below = np.cumsum(counts, axis=-1)
+        half = np.argmax(2 * below >= below[..., -1:], axis=-1)
+        return 1.4826 * least[:, None] * 2.0 ** ((half + 0.5) / 4.0)
+
+    def sums(self, parameters: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """Return the sums of `_judge`, shape (G, 5, _SUMS)."""
+        tasks = self.groups * KINDS
+        sums = runtime.empty((tasks, _SUMS), np.float64)
+        _judge(
+            tasks,
+            runtime.workers()[1],
+            self.points,
+            self.normals,
+            self.weight,
+            self.start,
+            runtime.upload(parameters.reshape(tasks, 8)),
+            runtime.upload(reach.reshape(tasks)),
+            sums,
+        )
+        return runtime.download(sums)[:tasks].reshape(self.groups, KINDS, _SUMS)
 
 
 def fit_all(
@@ -188,59 +247,84 @@ def fit_all(
 
     Returns:
         The fits; nearly flat groups get spheres and cylinders of huge radius, never infinite ones.
+        A kind that is far behind another one of the same group is not followed to its least rms.
     """
     runtime.ensure_started()
     groups = len(start) - 1
-    if weight is None:
-        weight = np.ones(len(points))
-    points, normals = np.asarray(points, np.float64), np.asarray(normals, np.float64)
-    start = np.asarray(start, np.int32)
+    points = np.ascontiguousarray(points, np.float64)
+    normals = np.ascontiguousarray(normals, np.float64)
+    weight = np.ones(len(points)) if weight is None else np.asarray(weight, np.float64)
+    start = np.ascontiguousarray(start, np.int32)
     m = gather_moments(points, normals, weight, start)
     extent = np.where(m.extent > 0.0, m.extent, 1.0)
-    state = starts(points, normals, weight, start, m)
     frame = np.column_stack((m.centre, 1.0 / extent))
-    samples = tuple(runtime.upload(a) for a in (points, normals, weight, start))
-    held = points, weight, start, frame
-    endless = np.full((groups, KINDS), np.inf)
-    never = np.zeros((groups, KINDS))
-    reach = endless
-    state, cost, normal = iterate(*held, reach, state, rounds=_ROUNDS)
+    samples = _Samples(points, normals, weight, start)
+    given = samples.points, samples.weight, start, frame
+    reach = np.full((groups, KINDS), np.inf)
+    state = starts(points, normals, weight, start, m)
+    state, normal = iterate(*given, reach, state, rounds=_ROUNDS, all_kinds=robust)
     scale = np.broadcast_to(np.asarray(noise, np.float64), groups)[:, None]
-    total = np.maximum(m.weight, 1e-300)[:, None]
-    for _ in range(3 if robust else 0):
-        least = np.maximum(np.sqrt(cost / total) * extent[:, None], 1e-12) / 2.0**12
-        parameters = to_parameters(state, m.centre, extent)
-        median = _judged(groups, samples, parameters, least, endless)[1]
-        reach = TUKEY * np.maximum(1.4826 * median, scale)
-        state, _, normal = iterate(*held, reach / extent[:, None], state, rounds=_ROUNDS)
+    for narrowed in range(_NARROWED + 1 if robust else 0):
+        spread = samples.spread(to_parameters(state, m.centre, extent), extent)
+        if narrowed == _NARROWED:
+            spread = np.repeat(spread.min(axis=1, keepdims=True), KINDS, axis=1)
+        reach = TUKEY * np.maximum(spread, scale)
+        state, normal = iterate(
+            *given, reach / extent[:, None], state, rounds=_ROUNDS, all_kinds=True
+        )
     parameters = to_parameters(state, m.centre, extent)
-    sums = _judged(groups, samples, parameters, never, reach)[0]
-    return _fits(parameters, sums, normal, extent, np.diff(start))
-
-
-def _fits(
-    parameters: np.ndarray,
-    sums: np.ndarray,
-    normal: np.ndarray,
-    extent: np.ndarray,
-    count: np.ndarray,
-) -> Fits:
-    """Return what the sums say; NaN where points are too few for the unknowns."""
-    few = count[:, None] <= UNKNOWNS[None, :]
-    counted, size = np.maximum(sums[..., 5], 1e-300), np.maximum(sums[..., 6], 1e-300)
-    rms = np.sqrt(sums[..., 2] / counted)
-    # A shift of 1 mm is 1 / extent; so is a change of a length by 1 mm. Turns have no unit.
-    unit = np.ones((*rms.shape, FREE.shape[1]))
-    unit[..., [0, 1, 2, 5, 6]] = 1.0 / extent[:, None, None]
-    unit[:, CONE, 5] = 1.0
-    normal = normal * unit[..., :, None] * unit[..., None, :] * (extent**2)[:, None, None, None]
-    bad = few | ~np.isfinite(rms)
+    sums = samples.sums(parameters, reach)
+    count = np.diff(start)
+    total, counted, size = (np.maximum(sums[..., k], 1e-300) for k in (0, 2, 7))
+    rms = np.sqrt(sums[..., 4] / counted)
+    bad = (count[:, None] <= FREEDOM[None, :]) | ~np.isfinite(rms)
     return Fits(
         parameters=np.where(bad[..., None], np.nan, parameters),
         rms=np.where(bad, np.nan, rms),
-        tilt=np.where(bad, np.nan, np.sqrt(np.maximum(1.0 - sums[..., 4] / size, 0.0))),
-        side=np.where(bad, np.nan, sums[..., 3] / size),
-        inside=np.where(bad, np.nan, sums[..., 1] / np.maximum(sums[..., 0], 1e-300)),
-        normal=normal,
+        loss=np.where(bad, np.nan, sums[..., 3] / total),
+        tilt=np.where(bad, np.nan, np.sqrt(np.maximum(1.0 - sums[..., 5] / size, 0.0))),
+        side=np.where(bad, np.nan, sums[..., 6] / size),
+        inside=np.where(bad, np.nan, sums[..., 1] / total),
         count=count,
+        extent=extent,
+        centre=m.centre,
+        state=state,
+        normal=normal,
     )
+
+
+def covariance(fits: Fits, kind: np.ndarray) -> np.ndarray:
+    """Return the covariance of the parameters of one surface of every group.
+
+    From the normal equations: s^2 (J'WJ)^-1 with s^2 the mean square distance over the points less
+    the unknowns. It holds for independent noise, and says nothing of faults that points share.
+
+    Args:
+        fits: The fits.
+        kind: The kind wanted of every group, shape (G,), 0..4.
+
+    Returns:
+        Of (point, axis, a, b), shape (G, 8, 8) [mm^2, rad^2]; zero for what is not estimated.
+    """
+    rows = np.arange(len(kind))
+    normal, free = fits.normal[rows, kind], FREE[kind]
+    # In units of the diagonal, and with a floor: what no point holds gets a large, finite value.
+    diagonal = np.einsum("gii->gi", normal)
+    unit = np.sqrt(np.where(free & (diagonal > 0.0), diagonal, 1.0))
+    value, vector = np.linalg.eigh(normal / (unit[:, :, None] * unit[:, None, :]))
+    inverse = 1.0 / np.maximum(value, 1e-14)
+    root = vector * np.sqrt(inverse)[:, None, :] / unit[:, :, None]
+    root *= free[:, :, None]
+    count = np.maximum(fits.count - FREEDOM[kind], 1)
+    deviation = np.nan_to_num(fits.rms[rows, kind]) * np.sqrt(fits.count / count) / fits.extent
+    root *= deviation[:, None, None]
+    change = np.empty((len(kind), 8, FREE.shape[1]))
+    small = 1e-6
+    for k in range(FREE.shape[1]):
+        step = np.zeros((len(kind), KINDS, FREE.shape[1]))
+        step[..., k] = small
+        ahead = to_parameters(moved(fits.state, step), fits.centre, fits.extent)
+        behind = to_parameters(moved(fits.state, -step), fits.centre, fits.extent)
+        change[..., k] = np.nan_to_num((ahead - behind)[rows, kind]) / (2.0 * small)
+    root = change @ root
+    return root @ np.swapaxes(root, 1, 2)

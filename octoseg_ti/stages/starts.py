@@ -49,7 +49,25 @@ class Moments(NamedTuple):
     """Mean of |q|^4, (G,)."""
 
 
-_COLUMNS = 5 + 36 + 12 + 1
+_COLUMNS = 2 + 5 * 3 + 4 * 9
+
+
+@ti.func
+def _put(rows: ti.template(), i: ti.i32, at: ti.i32, v: vec3):
+    """Write a vector into row ``i`` from column ``at`` on."""
+    for k in ti.static(range(3)):
+        rows[i, at + k] = v[k]
+
+
+@ti.func
+def _centre(point: ti.template(), weight: ti.template(), lo: ti.i32, hi: ti.i32):
+    """Return (sum of the weights, centre) of the samples lo..hi."""
+    total = 0.0
+    centre = vec3(0.0, 0.0, 0.0)
+    for i in range(lo, hi):
+        total += weight[i]
+        centre += weight[i] * row(point, i)
+    return total, centre / ti.max(total, 1e-300)
 
 
 @ti.kernel
@@ -68,12 +86,7 @@ def _gather_moments(
     for t in range(groups * stride):
         if t % stride == 0:
             g = t // stride
-            total = 0.0
-            centre = vec3(0.0, 0.0, 0.0)
-            for i in range(start_in[g], start_in[g + 1]):
-                total += weight_in[i]
-                centre += weight_in[i] * row(point_in, i)
-            centre = centre / ti.max(total, 1e-300)
+            total, centre = _centre(point_in, weight_in, start_in[g], start_in[g + 1])
             square = 0.0
             qq = mat3(0.0)
             nn = mat3(0.0)
@@ -100,18 +113,17 @@ def _gather_moments(
                 nnq += n.dot(q) * wn
                 sq += w * n.norm_sqr() * q
             moment_out[g, 0] = total
-            moment_out[g, 4] = square
-            for a in ti.static(range(3)):
-                moment_out[g, 1 + a] = centre[a]
-                moment_out[g, 41 + a] = wq[a]
-                moment_out[g, 44 + a] = sn[a]
-                moment_out[g, 47 + a] = nnq[a]
-                moment_out[g, 50 + a] = sq[a]
-                for b in ti.static(range(3)):
-                    moment_out[g, 5 + 3 * a + b] = qq[a, b]
-                    moment_out[g, 14 + 3 * a + b] = nn[a, b]
-                    moment_out[g, 23 + 3 * a + b] = kk[a, b]
-                    moment_out[g, 32 + 3 * a + b] = nk[a, b]
+            moment_out[g, 1] = square
+            _put(moment_out, g, 2, centre)
+            _put(moment_out, g, 5, wq)
+            _put(moment_out, g, 8, sn)
+            _put(moment_out, g, 11, nnq)
+            _put(moment_out, g, 14, sq)
+            for k in ti.static(range(9)):
+                moment_out[g, 17 + k] = qq[k // 3, k % 3]
+                moment_out[g, 26 + k] = nn[k // 3, k % 3]
+                moment_out[g, 35 + k] = kk[k // 3, k % 3]
+                moment_out[g, 44 + k] = nk[k // 3, k % 3]
 
 
 def gather_moments(
@@ -133,25 +145,25 @@ def gather_moments(
     )
     m = runtime.download(raw)[:groups]
     total = np.maximum(m[:, 0], 1e-300)
-    mean = m[:, 4:] / total[:, None]
-    matrices = mean[:, 1:37].reshape(groups, 4, 3, 3)
+    mean = m / total[:, None]
+    matrices = mean[:, 17:].reshape(groups, 4, 3, 3)
     square = np.trace(matrices[:, 0], axis1=1, axis2=2)
     extent = np.sqrt(square)
     e = np.where(extent > 0.0, extent, 1.0)
     e1, e2 = e[:, None], e[:, None, None]
     return Moments(
-        m[:, 0],
-        m[:, 1:4],
-        extent,
-        matrices[:, 0] / e2**2,
-        matrices[:, 1],
-        matrices[:, 2] / e2**2,
-        matrices[:, 3] / e2,
-        mean[:, 37:40] / e1**3,
-        mean[:, 40:43],
-        mean[:, 43:46] / e1,
-        mean[:, 46:49] / e1,
-        mean[:, 0] / e**4,
+        weight=m[:, 0],
+        centre=m[:, 2:5],
+        extent=extent,
+        qq=matrices[:, 0] / e2**2,
+        nn=matrices[:, 1],
+        kk=matrices[:, 2] / e2**2,
+        nk=matrices[:, 3] / e2,
+        wq=mean[:, 5:8] / e1**3,
+        n=mean[:, 8:11],
+        nnq=mean[:, 11:14] / e1,
+        q=mean[:, 14:17] / e1,
+        ww=mean[:, 1] / e**4,
     )
 
 
@@ -198,11 +210,10 @@ def _gather_profiles(
                 cq += w * vec3(c * x, c * z, c * c)
                 nn += w * vec3(nx * nx, nx * nz, nz * nz)
                 tq += (w * (nx * z - nz * x)) * vec2(-nz, nx)
-            for k in ti.static(range(3)):
-                moment_out[j, k] = s[k]
-                moment_out[j, 3 + k] = xz[k]
-                moment_out[j, 6 + k] = cq[k]
-                moment_out[j, 9 + k] = nn[k]
+            _put(moment_out, j, 0, s)
+            _put(moment_out, j, 3, xz)
+            _put(moment_out, j, 6, cq)
+            _put(moment_out, j, 9, nn)
             moment_out[j, 12] = tq[0]
             moment_out[j, 13] = tq[1]
 

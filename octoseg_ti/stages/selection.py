@@ -1,0 +1,105 @@
+"""Which kind of surface a group of points lies on: the simplest one that does not fit worse."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from octoseg_ti.device.surfaces import KINDS
+from octoseg_ti.stages.primitives import FREEDOM, Fits, covariance
+from octoseg_ti.types import SurfaceKind
+
+# A parameter more has to gain this many times log(n) in log-likelihood (times 2). BIC asks for 1
+# and takes the noise of points for independent; three times that holds where stripes or views share
+# some of it, and is four standard deviations for a hundred points.
+_PENALTY = 3.0
+_COUNTED = 500  # points beyond these prove nothing more: then it is form, no noise, that is seen
+_FORM = 0.1  # deviations of form, in noise, that no kind has to explain
+_ROUNDING = 1e-5  # ... and in extents, for data without noise
+_ROOM = 3.0  # a kind may be so many times the noise away, in rms
+_TILT = 2.0  # its normals may be so many times farther off than those of the best kind
+_TILT_ALWAYS = 0.1  # ... and this far [rad] at any rate
+_ONE_SIDED = 0.5  # least part of the size of the mean cosine that its sign must account for
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Choice:
+    """The surface of every one of ``G`` groups."""
+
+    kind: np.ndarray
+    """`SurfaceKind`, shape (G,), i8: FREE_FORM where no kind fits, NONE for too few points."""
+    parameters: np.ndarray
+    """As in `Segmentation.parameters`, shape (G, 8); NaN where there is no kind."""
+    rms: np.ndarray
+    """Root mean square distance to it [mm], shape (G,); for a free form, to the best kind."""
+    covariance: np.ndarray
+    """Covariance of the parameters, shape (G, 8, 8); NaN where there is no kind."""
+    side: np.ndarray
+    """Sign of the agreement of the measured normals with the outward ones, shape (G,), f64: 1 for
+    a boss, -1 for a hole; 0 where there is no kind."""
+    evidence: np.ndarray
+    """By how much the next best kind is worse, shape (G,): twice the difference in
+    log-likelihood less the penalties; small = could be either."""
+
+
+def choose(
+    fits: Fits,
+    *,
+    noise: float | np.ndarray,
+    room: float = _ROOM,
+    signed: bool = True,
+) -> Choice:
+    """Choose the kind of every group.
+
+    The scores of the kinds are n log(loss) plus a penalty for every unknown, so that each kind is
+    judged by the noise that it leaves, and the noise given only says what is too much. A larger
+    number of points does not make a plane with a trace of form into a huge cylinder: points count up
+    to a few hundred, and a tenth of the noise is taken for form.
+
+    Args:
+        fits: The fits of all kinds.
+        noise: Standard deviation of a point about its surface [mm], of all or of every group, (G,).
+        room: A kind fits up to this many times the noise, in rms.
+        signed: Normals point to the probe, so that both sides of a sheet are no plane.
+
+    Returns:
+        The choice. Of a robust fit the loss counts, so that points out of reach speak for no kind.
+    """
+    groups = len(fits.count)
+    sigma = np.broadcast_to(np.asarray(noise, np.float64), groups)[:, None]
+    form = np.maximum(_FORM * sigma, _ROUNDING * fits.extent[:, None])
+    counted = np.minimum(fits.count, _COUNTED)[:, None]
+    possible = np.isfinite(fits.loss)
+    loss = np.where(possible, fits.loss, np.inf)
+    score = counted * np.log(loss + form**2) + _PENALTY * FREEDOM * np.log(np.maximum(counted, 2))
+    fitting = possible & (fits.rms <= np.maximum(room * sigma, form)) & _agrees(fits, signed)
+    score = np.where(fitting, score, np.inf)
+    rows = np.arange(groups)
+    best = np.argmin(score, axis=1)
+    found = fitting[rows, best]
+    ordered = np.sort(score, axis=1)
+    with np.errstate(invalid="ignore"):
+        evidence = np.where(found, ordered[:, 1] - ordered[:, 0], np.nan)
+    nearest = np.argmin(np.where(possible, fits.rms, np.inf), axis=1)
+    kind = np.where(found, best, int(SurfaceKind.FREE_FORM))
+    kind[~possible.any(axis=1)] = int(SurfaceKind.NONE)
+    spread = np.full((groups, 8, 8), np.nan)
+    if found.any():
+        spread[found] = covariance(fits, np.minimum(best, KINDS - 1))[found]
+    return Choice(
+        kind=kind.astype(np.int8),
+        parameters=np.where(found[:, None], fits.parameters[rows, best], np.nan),
+        rms=fits.rms[rows, np.where(found, best, nearest)],
+        covariance=spread,
+        side=np.where(found, np.sign(np.nan_to_num(fits.side[rows, best])), 0.0),
+        evidence=evidence,
+    )
+
+
+def _agrees(fits: Fits, signed: bool) -> np.ndarray:
+    """Say where the measured normals are those of the surface, shape (G, 5)."""
+    tilt = np.where(np.isfinite(fits.tilt), fits.tilt, np.inf)
+    near = tilt <= np.maximum(_TILT * tilt.min(axis=1, keepdims=True), _TILT_ALWAYS)
+    if not signed:
+        return near
+    cosine = np.sqrt(np.maximum(1.0 - tilt**2, 0.0))
+    return near & (np.abs(np.nan_to_num(fits.side)) >= _ONE_SIDED * cosine)
