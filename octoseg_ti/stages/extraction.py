@@ -13,7 +13,7 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
-from octoseg_ti.device.surfaces import KINDS, surface_at
+from octoseg_ti.device.surfaces import KINDS, evaluate_surfaces, surface_at
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.stages.leaves import Leaves, Samples
 from octoseg_ti.stages.primitives import fit_all
@@ -45,6 +45,10 @@ _SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS = 40, 8, 200
 # A surface grows until it gains less than this, at most so often.
 _GAIN, _GROWTHS = 1.02, 4
 _LEFT = 0.005
+# Surfaces that a set was taken apart into are real when they explain so much of it, and leave no
+# more than this many noises: pieces of a free form are cut out as far as they just fit.
+_COVERED = 0.6
+_REAL = 1.1
 
 
 class Tolerance(NamedTuple):
@@ -351,7 +355,28 @@ def _take_apart(
             w.on[:, ~w.free[w.scored]] = 0.0
             if w.weight[w.free].sum() < max(_LEFT * w.weight.sum(), tolerance.points):
                 active.remove(s)
-    return found, label
+    return _real_ones(samples, sets, found, label, noise)
+
+
+def _real_ones(
+    samples: Samples, sets: list[np.ndarray], found: Surfaces, label: np.ndarray, noise: float
+) -> tuple[Surfaces, np.ndarray]:
+    """Drop the surfaces of sets that are free forms."""
+    real = np.zeros(len(found) + 1, bool)
+    for members in sets:
+        name, weight = label[members], samples.weight[members]
+        on = name >= 0
+        if not on.any() or weight[on].sum() < _COVERED * weight.sum():
+            continue
+        far, _ = evaluate_surfaces(
+            samples.point[members[on]], name[on], found.kind, found.parameters
+        )
+        rms = np.sqrt(np.average(far**2, weights=weight[on]))
+        real[name[on]] = rms <= _REAL * noise
+    kept = np.flatnonzero(real[:-1])
+    number = np.full(len(real), NONE, np.int32)
+    number[kept] = np.arange(len(kept), dtype=np.int32)
+    return found.at(kept), number[label]
 
 
 def _grow(
