@@ -161,13 +161,13 @@ def estimate_normals(
     if origin is not None and scans.frame == "view" and scans.T_world_view is not None:
         to_view = np.linalg.inv(scans.T_world_view[: len(origin)])
         origin = np.einsum("vij,vj->vi", to_view[:, :3, :3], origin) + to_view[:, :3, 3]
-    assert params.normals.gap is not None
     points, start, view, chosen = arranged.points, arranged.start, arranged.view, params.normals
+    assert chosen.gap is not None
     how: dict[str, Any] = {"gap": chosen.gap, "rule": chosen.rule, "origin": origin}
     normal = edge_pair_normals(points, start, view, weight=chosen.weight or "unit", **how)
     if chosen.smooth == 0:
         return normal, measured, _unfiltered(params)
-    noise, tilt = stripe_noise(points, normal, start, arranged.run, params.normals.gap)
+    noise, tilt = stripe_noise(points, normal, start, arranged.run, chosen.gap)
     noisy = replace(measured, noise=noise, normal_noise=tilt)
     params = replace(params, normals=derive(params, noisy).normals)
     assert params.normals.smooth is not None and params.normals.weight is not None
@@ -181,7 +181,7 @@ def estimate_normals(
             arranged.run,
             view,
             passes=params.normals.smooth,
-            gap=params.normals.gap,
+            gap=chosen.gap,
             noise=tilt,
             lag=square_lag(measured.spacing_along, measured.spacing_across),
         )

@@ -32,7 +32,7 @@ _DIAGONAL = 0.7
 _OPENING = 2
 # Spread that is nothing: in means of what noise leaves, plus so many times that of a curved face.
 _SPREAD_NOISES = 4.0
-_SPREAD_CURVED = 2.0
+_SPREAD_CURVED = 4.0
 _NONE = -1
 
 _vec3_f32 = ti.types.vector(3, ti.f32)

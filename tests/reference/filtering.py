@@ -89,7 +89,7 @@ def filter_normals(
             for choose in (np.min, np.min, np.max, np.max):
                 curved = extreme(curved, choose)
         lower = np.sort(spread)[: max(1, int(0.75 * len(spread)))]
-        least = 4.0 * lower.mean() + 2.0 * curved
+        least = 4.0 * lower.mean() + 4.0 * curved
         n = mean((least / (least + np.maximum(0.0, spread - curved))) ** 2, 1e9)
     n[~normals.any(axis=1)] = 0.0
     return n
