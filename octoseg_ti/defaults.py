@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from octoseg_ti.params import Params
@@ -29,6 +30,11 @@ ISOLATION_SPACINGS = 5.0
 """A point is isolated when its neighbours on the stripe are farther than this many spacings."""
 PATCH_CELLS = 16.0
 """A patch covers at least the area of this many smallest cells: a square of four by four."""
+SMOOTH_PASSES = (2, 6)
+"""Passes of the filter of normals: two restore an edge after the first mean, more do not help."""
+SMOOTH_LEFT = 0.5
+"""After n means over neighbours this over n of the noise of the normals is left. (A normal is made
+of differences of heights, so errors cancel out faster than independent ones do.)"""
 HOMOGENEITY = (7.0, 0.1, 0.25)
 """Angle between touching cells: this many tolerances, at least and at most so many radians."""
 
@@ -36,6 +42,19 @@ HOMOGENEITY = (7.0, 0.1, 0.25)
 def spacing_of(measured: Measurement) -> float:
     """Return the larger of the two spacings [mm]: it limits what can be resolved."""
     return max(measured.spacing_along, measured.spacing_across)
+
+
+def passes_for(normal_noise: float) -> int:
+    """Return how often normals are to be filtered: 0 where the least tolerance holds without.
+
+    Args:
+        normal_noise: Deviation of the normals from those of the surface [rad].
+    """
+    aim = LEAST_TOLERANCE / NOISE_FLOORS
+    if normal_noise <= aim:
+        return 0
+    least, most = SMOOTH_PASSES
+    return min(most, max(least, math.ceil(SMOOTH_LEFT * normal_noise / aim) - 1))
 
 
 def derive(params: Params, measured: Measurement) -> Params:
@@ -54,6 +73,10 @@ def derive(params: Params, measured: Measurement) -> Params:
         cleaning = replace(cleaning, isolation=ISOLATION_SPACINGS * spacing)
     if normals.gap is None:
         normals = replace(normals, gap=GAP_SPACINGS * spacing)
+    if normals.smooth is None:
+        normals = replace(normals, smooth=passes_for(measured.normal_noise))
+    if normals.weight is None:
+        normals = replace(normals, weight="area" if normals.smooth else "unit")
     registration = params.registration
     if registration.reach is None:
         registration = replace(registration, reach=REACH_SPACINGS * spacing)

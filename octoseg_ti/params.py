@@ -34,8 +34,12 @@ class NormalParams:
     """Next point of the march: by the shorter diagonal, or by the distance along y (the paper)."""
     gap: float | None = None
     """Longest edge of a triangle [mm]; longer ones break the strip. Default: from the spacing."""
-    weight: Literal["unit", "area"] = "unit"
-    """Mean of unit normals (Eq. 1), or weighted by the area of the triangles."""
+    weight: Literal["unit", "area"] | None = None
+    """Mean of unit normals (Eq. 1), or weighted by the area of the triangles. Default: by area
+    where noisy normals are filtered, for there the errors of heights cancel out; else unit."""
+    smooth: int | None = None
+    """Passes of the filter that smooths normals within faces and keeps edges; 0 = off. Default:
+    from their noise, 0 where it is below the least tolerance."""
     neighbors: int = 12
     """Neighbours of a point when the input has no stripes (I8)."""
 
@@ -163,7 +167,7 @@ def paper(
     """
     return Params(
         cleaning=CleaningParams(enabled=False),
-        normals=NormalParams(rule="paper"),
+        normals=NormalParams(rule="paper", weight="unit", smooth=0),
         grid=GridParams(
             divisions=divisions,
             tolerance=tolerance,

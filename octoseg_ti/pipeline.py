@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from octoseg_ti.params import Params, preset_params
 from octoseg_ti.patches import assemble, grow_regions
 from octoseg_ti.stages.cleaning import mark_outliers
 from octoseg_ti.stages.edges import edges_by_level, edges_by_radius, edges_by_reason
+from octoseg_ti.stages.filtering import filter_normals, independent_lag, square_lag
 from octoseg_ti.stages.grid import Grid, build_grid
 from octoseg_ti.stages.measure import stripe_noise, stripe_spacing
 from octoseg_ti.stages.moments import LEVEL, STOP
@@ -78,7 +80,7 @@ def segment(
     with stage("cleaning"):
         arranged, measured, params = clean(scans, params)
     with stage("normals"):
-        normal, measured = estimate_normals(scans, arranged, measured, params)
+        normal, measured, params = estimate_normals(scans, arranged, measured, params)
     with stage("registration"):
         point, normal, aligned = register(scans, arranged, normal, measured, params)
     with stage("measure"):
@@ -113,10 +115,12 @@ def clean(scans: Scans, params: Params) -> tuple[Arranged, Measurement, Params]:
     measured = Measurement(
         spacing_along=along or across, spacing_across=across or along, noise=0.0, normal_noise=0.0
     )
+    derived = derive(params, measured)
     params = replace(
         params,
-        cleaning=derive(params, measured).cleaning,
-        normals=derive(params, measured).normals,
+        cleaning=derived.cleaning,
+        # How to filter the normals is known when their noise is.
+        normals=replace(params.normals, gap=derived.normals.gap),
     )
     assert params.cleaning.spike is not None and params.cleaning.isolation is not None
     if params.cleaning.enabled:
@@ -134,8 +138,11 @@ def clean(scans: Scans, params: Params) -> tuple[Arranged, Measurement, Params]:
 
 def estimate_normals(
     scans: Scans, arranged: Arranged, measured: Measurement, params: Params
-) -> tuple[np.ndarray, Measurement]:
-    """Return the normals of the arranged points, in the frame of the scans."""
+) -> tuple[np.ndarray, Measurement, Params]:
+    """Return the normals of the arranged points, in the frame of the scans; filtered where noisy.
+
+    With them come the measurement and the parameters, with what was found on the way.
+    """
     if arranged.run is None or arranged.start is None:
         if scans.origin is not None:
             outward = scans.origin[arranged.view] - arranged.points
@@ -143,24 +150,48 @@ def estimate_normals(
             low, high = arranged.points.min(axis=0), arranged.points.max(axis=0)
             outward = arranged.points - (low + high) / 2.0
         estimated, measured = neighbor_normals(arranged.points, outward, params.normals.neighbors)
-        return (estimated if arranged.normals is None else arranged.normals), measured
+        return (
+            (estimated if arranged.normals is None else arranged.normals),
+            measured,
+            _unfiltered(params),
+        )
     if arranged.normals is not None:
-        return arranged.normals, measured
+        return arranged.normals, measured, _unfiltered(params)
     origin = scans.origin
     if origin is not None and scans.frame == "view" and scans.T_world_view is not None:
         to_view = np.linalg.inv(scans.T_world_view[: len(origin)])
         origin = np.einsum("vij,vj->vi", to_view[:, :3, :3], origin) + to_view[:, :3, 3]
-    assert params.normals.gap is not None
-    estimated = edge_pair_normals(
-        arranged.points,
-        arranged.start,
-        arranged.view,
-        gap=params.normals.gap,
-        rule=params.normals.rule,
-        weight=params.normals.weight,
-        origin=origin,
-    )
-    return estimated, measured
+    points, start, view, chosen = arranged.points, arranged.start, arranged.view, params.normals
+    assert chosen.gap is not None
+    how: dict[str, Any] = {"gap": chosen.gap, "rule": chosen.rule, "origin": origin}
+    normal = edge_pair_normals(points, start, view, weight=chosen.weight or "unit", **how)
+    if chosen.smooth == 0:
+        return normal, measured, _unfiltered(params)
+    noise, tilt = stripe_noise(points, normal, start, arranged.run, chosen.gap)
+    noisy = replace(measured, noise=noise, normal_noise=tilt)
+    params = replace(params, normals=derive(params, noisy).normals)
+    assert params.normals.smooth is not None and params.normals.weight is not None
+    if params.normals.smooth > 0:
+        if params.normals.weight != (chosen.weight or "unit"):
+            normal = edge_pair_normals(points, start, view, weight=params.normals.weight, **how)
+        normal = filter_normals(
+            points,
+            normal,
+            start,
+            arranged.run,
+            view,
+            passes=params.normals.smooth,
+            gap=chosen.gap,
+            noise=tilt,
+            lag=square_lag(measured.spacing_along, measured.spacing_across),
+        )
+    return normal, measured, params
+
+
+def _unfiltered(params: Params) -> Params:
+    """Return the parameters for normals that are not filtered."""
+    weight = params.normals.weight or "unit"
+    return replace(params, normals=replace(params.normals, smooth=0, weight=weight))
 
 
 def register(
@@ -212,7 +243,12 @@ def measure_noise(
     if arranged.run is None or arranged.start is None:
         return measured
     assert params.normals.gap is not None
-    noise, tilt = stripe_noise(point, normal, arranged.start, arranged.run, params.normals.gap)
+    lag = independent_lag(
+        params.normals.smooth or 0, square_lag(measured.spacing_along, measured.spacing_across)
+    )
+    noise, tilt = stripe_noise(
+        point, normal, arranged.start, arranged.run, params.normals.gap, lag=lag
+    )
     return replace(measured, noise=noise, normal_noise=tilt)
 
 

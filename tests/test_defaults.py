@@ -61,7 +61,7 @@ def test_noise_raises_the_tolerance_and_the_spike() -> None:
 def test_given_values_stay() -> None:
     given = Params(
         cleaning=CleaningParams(spike=0.7, isolation=8.0),
-        normals=NormalParams(gap=0.9),
+        normals=NormalParams(gap=0.9, weight="area", smooth=4),
         registration=RegistrationParams(reach=2.5),
         grid=GridParams(tolerance=0.2, edge_tolerance=0.25, min_cell=3.0, divisions=7),
         regions=RegionParams(homogeneity=0.5, min_points=11),

@@ -9,14 +9,12 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row
 from octoseg_ti.device.runtime import F32Array, F64Rows, I32Array, ti
+from octoseg_ti.stages.sampling import sample_stripes, trimmed_mean
 
-_SAMPLES = 25_000
 # Mean of the lower three quarters of |x| for x normal, and of a Rayleigh variable, both of unit
-# scale. Trimmed means instead of medians: coarse quantisation can make a median zero.
-_TRIM = 0.75
+# scale.
 _HALF_NORMAL_TRIMMED = 0.5149
 _RAYLEIGH_TRIMMED = 0.9558
-_LAG = 3
 
 
 @ti.kernel
@@ -79,7 +77,7 @@ def _measure_noise(
 ):
     """Write second differences along the stripe: of the range with lag 1, of the normal with a lag.
 
-    With a lag of 3 the three normals share no triangle, so their errors are independent.
+    Only the part of the latter along the surface counts: the other is curvature.
     """
     for s in sample_in:
         range_out[s] = -1.0
@@ -100,28 +98,8 @@ def _measure_noise(
                 b = row(normal_in, i + lag)
                 near = (row(point_in, i - lag) - row(point_in, i + lag)).norm()
                 if a.norm() > 0.5 and b.norm() > 0.5 and near <= 2 * lag * gap:
-                    tilt_out[s] = ti.cast((normal - 0.5 * (a + b)).norm(), ti.f32)
-
-
-def _samples(start: np.ndarray) -> np.ndarray:
-    """Return about `_SAMPLES` points, evenly along every stripe from its first one, i32."""
-    step = max(1, int(start[-1]) // _SAMPLES)
-    counts = -(-np.diff(start) // step)
-    ends = np.cumsum(counts)
-    within = np.arange(ends[-1], dtype=np.int32) - np.repeat(
-        (ends - counts).astype(np.int32), counts
-    )
-    return np.repeat(start[:-1], counts) + np.int32(step) * within
-
-
-def _trimmed_mean(values: np.ndarray) -> float:
-    """Return the mean of the lower three quarters of the non-negative values, or 0."""
-    values = values[values >= 0]
-    if len(values) == 0:
-        return 0.0
-    keep = max(1, int(_TRIM * len(values)))
-    # Sorted, so that the sum does not depend on the order of the views.
-    return float(np.mean(np.sort(values)[:keep], dtype=np.float64))
+                    middle = 0.5 * (a + b)
+                    tilt_out[s] = ti.cast((middle - middle.dot(normal) * normal).norm(), ti.f32)
 
 
 def _median(values: np.ndarray) -> float:
@@ -145,7 +123,7 @@ def stripe_spacing(
         Spacing along and across; 0 where nothing could be measured.
     """
     runtime.ensure_started()
-    sample = _samples(start)
+    sample = sample_stripes(start)
     along = runtime.empty(len(sample), np.float32)
     across = runtime.empty(len(sample), np.float32)
     _measure_spacing(
@@ -162,7 +140,13 @@ def stripe_spacing(
 
 
 def stripe_noise(
-    points: np.ndarray, normals: np.ndarray, start: np.ndarray, run: np.ndarray, gap: float
+    points: np.ndarray,
+    normals: np.ndarray,
+    start: np.ndarray,
+    run: np.ndarray,
+    gap: float,
+    *,
+    lag: int = 3,
 ) -> tuple[float, float]:
     """Return the noise of the range [mm] and of the normals [rad], measured along the stripes.
 
@@ -175,16 +159,18 @@ def stripe_noise(
         start: First point of every stripe, and N at the end, shape (S + 1,), i32.
         run: Index of the stripe of every point, shape (N,), i32.
         gap: Longest distance between neighbours [mm].
+        lag: Points between normals whose errors are independent. Three edge-pair normals with a
+            lag of 3 share no triangle; filtered normals need more.
 
     Returns:
         Standard deviation of the range, and root mean square deviation of the normals.
     """
     runtime.ensure_started()
-    sample = _samples(start)
+    sample = sample_stripes(start)
     second = runtime.empty(len(sample), np.float32)
     tilt = runtime.empty(len(sample), np.float32)
     _measure_noise(
-        _LAG,
+        lag,
         gap,
         runtime.upload(sample),
         runtime.upload(points),
@@ -194,7 +180,7 @@ def stripe_noise(
         second,
         tilt,
     )
-    noise = _trimmed_mean(runtime.download(second)) / _HALF_NORMAL_TRIMMED / np.sqrt(6.0)
+    noise = trimmed_mean(runtime.download(second)) / _HALF_NORMAL_TRIMMED / np.sqrt(6.0)
     # Two components of the tilt, each with 1 + 1/4 + 1/4 of the variance of one normal.
-    component = _trimmed_mean(runtime.download(tilt)) / _RAYLEIGH_TRIMMED / np.sqrt(1.5)
+    component = trimmed_mean(runtime.download(tilt)) / _RAYLEIGH_TRIMMED / np.sqrt(1.5)
     return float(noise), float(component * np.sqrt(2.0))

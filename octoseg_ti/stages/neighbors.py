@@ -81,11 +81,7 @@ def neighbor_normals(
 
     Returns:
         Unit normals, shape (N, 3), f64, zero where the neighbours define no plane; and the
-    <<<<<<< HEAD
         measurement: the spacing is the median distance to the nearest other place, noise the rms
-    =======
-        measurement: the spacing is the median distance to the nearest place, the noise the rms
-    >>>>>>> stages
         distance from the planes, the noise of the normals what that makes of a plane fit.
 
     Raises:

@@ -68,9 +68,12 @@ def lower_three_quarters(values: list[float]) -> float:
 
 
 def stripe_noise(
-    points: np.ndarray, normals: np.ndarray, start: np.ndarray, gap: float
+    points: np.ndarray, normals: np.ndarray, start: np.ndarray, gap: float, lag: int = 3
 ) -> tuple[float, float]:
-    """Return range noise [mm] and noise of the normals [rad] from second differences."""
+    """Return range noise [mm] and noise of the normals [rad] from second differences.
+
+    Of the difference between a normal and the middle of two others, the part along the surface.
+    """
     second, tilt = [], []
     for stripe in runs(start):
         for i in stripe:
@@ -81,10 +84,12 @@ def stripe_noise(
                 a, b = points[i - 1] - p, points[i + 1] - p
                 if max(np.linalg.norm(a), np.linalg.norm(b)) <= gap:
                     second.append(abs(float((a + b) @ normals[i])))
-            if i - 3 in stripe and i + 3 in stripe:
-                m, n = normals[i - 3], normals[i + 3]
-                if m.any() and n.any() and np.linalg.norm(points[i - 3] - points[i + 3]) <= 6 * gap:
-                    tilt.append(float(np.linalg.norm(normals[i] - (m + n) / 2)))
+            if i - lag in stripe and i + lag in stripe:
+                m, n = normals[i - lag], normals[i + lag]
+                far = np.linalg.norm(points[i - lag] - points[i + lag]) > 2 * lag * gap
+                if m.any() and n.any() and not far:
+                    off = normals[i] - (m + n) / 2
+                    tilt.append(float(np.linalg.norm(off - (off @ normals[i]) * normals[i])))
     # Expected trimmed means of the distributions that pure noise of unit size would give.
     normal, q = NormalDist(), NormalDist().inv_cdf(0.875)  # three quarters lie within -q..q
     half_normal = 2 * (normal.pdf(0) - normal.pdf(q)) / 0.75

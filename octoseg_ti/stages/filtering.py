@@ -1,0 +1,355 @@
+"""Noisy normals made smooth within faces, with the edges between them kept or restored.
+
+A mean over neighbours rounds edges off, and weights by the angle between two normals (a bilateral
+filter) cannot keep an edge that is no larger than the noise of one normal. So the mean comes first
+and edges are restored from it: how far the normals around a point spread tells a point on a rounded
+edge from one inside a face, and every further pass takes a mean with weights that favour neighbours
+inside faces. The faces thus grow back to the edge from both sides.
+
+What is curved all over spreads as well, and must stay as it is. Only the part of the spread counts
+that is narrow, as a rounded edge is: what a morphological opening takes away.
+
+After the ideas of guided and of Tukey-weighted normal filtering (Zhang et al. 2015, Yadav et al.
+2018), in a form that needs sums over eight neighbours only.
+"""
+
+import math
+
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.device.linalg import row
+from octoseg_ti.device.runtime import F32Array, F32Rows, F64Rows, I32Array, I32Rows, ti
+from octoseg_ti.stages.sampling import sample_stripes, trimmed_mean
+
+# The first mean leaves out normals farther away than this many standard deviations: at 0.01 mm and
+# 0.25 mm spacing a sharp edge of 15 degrees. Nearer limits leave single bad normals alone for good.
+_GATE = 8.5
+# Diagonal neighbours are farther away by the root of two.
+_DIAGONAL = 0.7
+# An opening of twice two rings removes what is narrower than five points: an edge after the first
+# mean, and no fillet that stripes could resolve.
+_OPENING = 2
+# Spread that is nothing: in means of what noise leaves, plus so many times that of a curved face.
+_SPREAD_NOISES = 4.0
+_SPREAD_CURVED = 4.0
+_NONE = -1
+
+_vec3_f32 = ti.types.vector(3, ti.f32)
+
+
+@ti.func
+def _row32(rows: ti.template(), i: ti.i32) -> _vec3_f32:
+    """Return row ``i`` in the precision of the noisy normals, which is all they need."""
+    return _vec3_f32(rows[i, 0], rows[i, 1], rows[i, 2])
+
+
+@ti.kernel
+def _find_partners(
+    stripes: ti.i32,
+    stride: ti.i32,
+    # In:
+    point_in: F64Rows,
+    start_in: I32Array,
+    view_in: I32Array,
+    # Out:
+    partner_out: I32Rows,
+):
+    """Write the nearest point on the stripe before and on the one after, -1 where there is none.
+
+    Both are found by going along, for neighbouring stripes run the same way; looking two points
+    ahead gets over noise.
+    """
+    for u in range(stripes * stride):
+        s = u // stride
+        if u % stride == 0:
+            for side in ti.static(range(2)):
+                other = s - 1 + 2 * side
+                last = -1
+                j = 0
+                if other >= 0 and other < stripes:
+                    if view_in[start_in[other]] == view_in[start_in[s]]:
+                        j = start_in[other]
+                        last = start_in[other + 1] - 1
+                for i in range(start_in[s], start_in[s + 1]):
+                    if last < 0:
+                        partner_out[i, side] = _NONE
+                    else:
+                        p = row(point_in, i)
+                        best = (row(point_in, j) - p).norm_sqr()
+                        going = 1
+                        while going == 1:
+                            going = 0
+                            for ahead in ti.static((1, 2)):
+                                k = ti.min(j + ahead, last)
+                                d = (row(point_in, k) - p).norm_sqr()
+                                if going == 0 and k > j and d <= best:
+                                    best = d
+                                    j = k
+                                    going = 1
+                        partner_out[i, side] = j
+
+
+@ti.kernel
+def _link(
+    lag: ti.i32,
+    gap: ti.f64,
+    # In:
+    point_in: F64Rows,
+    normal_in: F32Rows,
+    start_in: I32Array,
+    run_in: I32Array,
+    partner_in: I32Rows,
+    # Out:
+    ring_out: I32Rows,
+):
+    """Write the eight neighbours of every point; itself where one is missing.
+
+    Two on its own stripe, the two partners, and two beside each partner.
+    """
+    for i in run_in:
+        p = row(point_in, i)
+        found = ti.Vector([i] * 8)
+        for side in ti.static(range(3)):
+            base = i
+            if ti.static(side > 0):
+                base = partner_in[i, side - 1]
+            if base >= 0:
+                s = run_in[base]
+                first = start_in[s]
+                stop = start_in[s + 1]
+                for k, step in ti.static(
+                    (((0, -1), (1, 1)), ((2, 0), (4, -1), (5, 1)), ((3, 0), (6, -1), (7, 1)))[side]
+                ):
+                    j = base + step * lag
+                    if j >= first and j < stop:
+                        if (row(point_in, j) - p).norm_sqr() <= gap * gap:
+                            if _row32(normal_in, j).norm_sqr() > 0.25:
+                                found[k] = j
+        for k in ti.static(range(8)):
+            ring_out[i, k] = found[k]
+
+
+@ti.kernel
+def _average_near(
+    per_limit: ti.f32,
+    # In:
+    ring_in: I32Rows,
+    normal_in: F32Rows,
+    # Out:
+    normal_out: F32Rows,
+):
+    """Write the mean of every normal and its neighbours by Tukey's biweight of their distance.
+
+    Per limit is one over the square of the distance from which on they count nothing.
+    """
+    for i in range(ring_in.shape[0]):
+        n = _row32(normal_in, i)
+        total = n
+        for k in ti.static(range(8)):
+            j = ring_in[i, k]
+            m = _row32(normal_in, j)
+            w = ti.max(ti.cast(0.0, ti.f32), 1 - per_limit * (m - n).norm_sqr())
+            w = w * w * (j != i)
+            if ti.static(k >= 4):
+                w = w * ti.cast(_DIAGONAL, ti.f32)
+            total += w * m
+        size = total.norm()
+        if size > 0:
+            n = total / size
+        for k in ti.static(range(3)):
+            normal_out[i, k] = n[k]
+
+
+@ti.kernel
+def _average(
+    # In:
+    ring_in: I32Rows,
+    normal_in: F32Rows,
+    weight_in: F32Array,
+    # Out:
+    normal_out: F32Rows,
+):
+    """Write the weighted mean of every normal and its neighbours."""
+    for i in weight_in:
+        n = _row32(normal_in, i)
+        total = weight_in[i] * n
+        for k in ti.static(range(8)):
+            j = ring_in[i, k]
+            w = weight_in[j] * (j != i)
+            if ti.static(k >= 4):
+                w = w * ti.cast(_DIAGONAL, ti.f32)
+            total += w * _row32(normal_in, j)
+        size = total.norm()
+        if size > 0:
+            n = total / size
+        for k in ti.static(range(3)):
+            normal_out[i, k] = n[k]
+
+
+@ti.kernel
+def _measure_spread(
+    # In:
+    ring_in: I32Rows,
+    normal_in: F32Rows,
+    # Out:
+    spread_out: F32Array,
+):
+    """Write the mean square distance of the neighbouring normals from each normal."""
+    for i in spread_out:
+        n = _row32(normal_in, i)
+        near = ti.cast(0.0, ti.f32)
+        far = ti.cast(0.0, ti.f32)
+        count = 0
+        for k in ti.static(range(8)):
+            j = ring_in[i, k]
+            d = (_row32(normal_in, j) - n).norm_sqr()
+            if ti.static(k < 4):
+                near += d
+                count += 2 * ti.cast(j != i, ti.i32)
+            else:
+                far += d
+                count += ti.cast(j != i, ti.i32)
+        spread_out[i] = (2 * near + far) / ti.max(count, 1)
+
+
+@ti.kernel
+def _open(
+    sign: ti.i32,
+    # In:
+    ring_in: I32Rows,
+    value_in: F32Array,
+    # Out:
+    value_out: F32Array,
+):
+    """Write the least value of every neighbourhood (sign 1), or the largest (sign -1)."""
+    for i in value_in:
+        least = sign * value_in[i]
+        for k in ti.static(range(8)):
+            least = ti.min(least, sign * value_in[ring_in[i, k]])
+        value_out[i] = sign * least
+
+
+@ti.kernel
+def _weigh(
+    nothing: ti.f64,
+    # In:
+    spread_in: F32Array,
+    curved_in: F32Array,
+    # Out:
+    weight_out: F32Array,
+):
+    """Write how much a point counts: 1 inside a face, little on an edge."""
+    for i in spread_in:
+        curved = ti.cast(curved_in[i], ti.f64)
+        least = nothing + _SPREAD_CURVED * curved
+        w = least / (least + ti.max(0.0, spread_in[i] - curved))
+        weight_out[i] = ti.cast(w * w, ti.f32)
+
+
+@ti.kernel
+def _finish(
+    # In:
+    filtered_in: F32Rows,
+    run_in: I32Array,
+    # Out:
+    normal_inout: F64Rows,
+):
+    """Write the filtered normals in full length where there was a normal."""
+    for i in run_in:
+        if row(normal_inout, i).norm_sqr() > 0.25:
+            n = row(filtered_in, i).normalized()
+            for k in ti.static(range(3)):
+                normal_inout[i, k] = n[k]
+
+
+def square_lag(along: float, across: float) -> int:
+    """Return how many points of a stripe span about the distance to the next stripe, 1, 2, 4 ...
+
+    Args:
+        along: Spacing along the stripes [mm].
+        across: Spacing of the stripes [mm].
+    """
+    if along <= 0.0 or across <= along:
+        return 1
+    return int(2 ** round(math.log2(across / along)))
+
+
+def independent_lag(passes: int, lag: int = 1) -> int:
+    """Return how many points apart on a stripe the errors of two filtered normals are independent.
+
+    Args:
+        passes: Passes of the filter after the first mean; 0 = not filtered.
+        lag: Distance of neighbours in the filter [points].
+    """
+    if passes == 0:
+        return 3
+    # Every mean spreads an error by 0.8 neighbours, edge pairs by 0.7; errors farther apart than
+    # three times the root of the sum of squares share next to nothing.
+    return lag * math.ceil(3.0 * math.sqrt(0.6 * (passes + 1) + 0.5))
+
+
+def filter_normals(
+    points: np.ndarray,
+    normals: np.ndarray,
+    start: np.ndarray,
+    run: np.ndarray,
+    view: np.ndarray,
+    *,
+    passes: int,
+    gap: float,
+    noise: float,
+    lag: int = 1,
+) -> np.ndarray:
+    """Smooth the normals of stripes within faces and keep the edges between them.
+
+    Args:
+        points: Positions [mm], shape (N, 3), f64, in stripe order.
+        normals: Unit normals, shape (N, 3), f64; zero rows have none, and keep none.
+        start: First point of every stripe, and N at the end, shape (S + 1,), i32.
+        run: Index of the stripe of every point, shape (N,), i32.
+        view: View of every point, shape (N,), i32.
+        passes: Passes that restore edges, after the one that averages; 0 returns the normals.
+        gap: Longest distance between neighbours [mm].
+        noise: Deviation of the normals from those of the surface [rad].
+        lag: Neighbours on a stripe are this many points apart, a power of two: as far as stripes.
+
+    Returns:
+        Unit normals, shape (N, 3), f64.
+    """
+    if passes == 0:
+        return normals
+    runtime.ensure_started()
+    n, stripes = len(points), len(start) - 1
+    point, starts, runs = runtime.upload(points), runtime.upload(start), runtime.upload(run)
+    partner, ring = runtime.empty((n, 2), np.int32), runtime.empty((n, 8), np.int32)
+    _, stride = runtime.workers()
+    _find_partners(stripes, stride, point, starts, runtime.upload(view), partner)
+    raw = runtime.upload(normals.astype(np.float32))
+    old, new, spare = raw, *(runtime.empty((n, 3), np.float32) for _ in range(2))
+    # Dense stripes: means over one, two, four ... points first, until the steps are square.
+    step = 1
+    while True:
+        _link(step, gap, point, raw, starts, runs, partner, ring)
+        _average_near(1.0 / (_GATE * noise) ** 2, ring, old, new)
+        old, new, spare = new, spare, new
+        if step >= lag:
+            break
+        step *= 2
+    spread, curved, scratch, weight = (runtime.empty(n, np.float32) for _ in range(4))
+    sample = sample_stripes(start)
+    for again in range(passes):
+        _measure_spread(ring, old, spread)
+        if again == 0:
+            _open(1, ring, spread, curved)
+            for sign in (1,) * (_OPENING - 1) + (-1,) * _OPENING:
+                _open(sign, ring, curved, scratch)
+                curved, scratch = scratch, curved
+        # Where there is no spread at all, every weight is the same.
+        nothing = _SPREAD_NOISES * trimmed_mean(runtime.download(spread)[sample])
+        _weigh(max(nothing, 1e-12), spread, curved, weight)
+        _average(ring, old, weight, new)
+        old, new = new, old
+    result = runtime.upload(normals.copy())
+    _finish(old, runs, result)
+    return runtime.download(result)
