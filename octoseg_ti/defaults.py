@@ -38,6 +38,15 @@ of differences of heights, so errors cancel out faster than independent ones do.
 HOMOGENEITY = (7.0, 0.1, 0.25)
 """Angle between touching cells: this many tolerances, at least and at most so many radians."""
 
+SURFACE_NOISE = (1.3, 0.02)
+"""A point deviates from its surface by this many standard deviations of the noise, plus so many
+spacings: surfaces are fitted to noisy points, and rounding leaves something on perfect data."""
+TURNS = (0.25, 4.0)
+"""A sample lies on a surface when its normal is off by no more than this angle [rad], or so many
+deviations of the normals."""
+LEAST_TILT = 0.05
+"""Deviation of the normals from those of a surface even on perfect data [rad]: edges smear them."""
+
 
 def spacing_of(measured: Measurement) -> float:
     """Return the larger of the two spacings [mm]: it limits what can be resolved."""
@@ -96,6 +105,13 @@ def derive(params: Params, measured: Measurement) -> Params:
         area = PATCH_CELLS * (CELL_SPACINGS * spacing) ** 2
         one = measured.spacing_along * measured.spacing_across
         regions = replace(regions, min_points=max(3, round(area / one)) if one > 0 else 3)
+    surfaces = params.surfaces
+    if surfaces.noise is None:
+        times, share = SURFACE_NOISE
+        noise = max(measured.noise, measured.surface_noise)
+        surfaces = replace(surfaces, noise=times * noise + share * spacing)
+    if surfaces.tilt is None:
+        surfaces = replace(surfaces, tilt=max(LEAST_TILT, measured.normal_noise))
     return replace(
         params,
         cleaning=cleaning,
@@ -103,4 +119,5 @@ def derive(params: Params, measured: Measurement) -> Params:
         registration=registration,
         grid=grid,
         regions=regions,
+        surfaces=surfaces,
     )

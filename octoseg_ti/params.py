@@ -101,6 +101,19 @@ class RegionParams:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SurfaceParams:
+    """Analytic surfaces through the regions, and the points that lie on them (F1)."""
+
+    enabled: bool = True
+    """Explain regions by planes, cylinders, cones, spheres and tori: split and merge by them, and
+    give every point to the surface that it fits."""
+    noise: float | None = None
+    """Deviation of a point from its surface [mm]; default: from the data."""
+    tilt: float | None = None
+    """Deviation of its normal [rad]; default: from the noise of the normals."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Params:
     """All parameters of `segment`."""
 
@@ -110,6 +123,7 @@ class Params:
     grid: GridParams = field(default_factory=GridParams)
     edges: EdgeParams = field(default_factory=EdgeParams)
     regions: RegionParams = field(default_factory=RegionParams)
+    surfaces: SurfaceParams = field(default_factory=SurfaceParams)
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain values, for JSON."""
@@ -129,6 +143,7 @@ class Params:
             "grid": GridParams,
             "edges": EdgeParams,
             "regions": RegionParams,
+            "surfaces": SurfaceParams,
         }
         built = {}
         for name, section in values.items():
@@ -179,6 +194,7 @@ def paper(
             rule="levels", smallest_levels=smallest_levels, fillet_levels=fillet_levels
         ),
         regions=RegionParams(homogeneity=homogeneity, min_points=min_points, assign_edges=False),
+        surfaces=SurfaceParams(enabled=False),
     )
 
 

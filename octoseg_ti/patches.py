@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,8 @@ from octoseg_ti.arrange import Arranged
 from octoseg_ti.defaults import spacing_of
 from octoseg_ti.device import runtime
 from octoseg_ti.params import Params
-from octoseg_ti.stages.adjacency import find_touching
+from octoseg_ti.device.surfaces import evaluate_surfaces
+from octoseg_ti.stages.adjacency import Adjacency, find_touching
 from octoseg_ti.stages.assignment import (
     assign_points,
     claimed_share,
@@ -23,7 +25,15 @@ from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.moments import LEVEL, NORMAL, SIGMA, STOP, X, Z
 from octoseg_ti.stages.planes import fit_planes
 from octoseg_ti.stages.regions import flood_fill, number_groups, strips
-from octoseg_ti.types import NONE, Cells, EdgeClass, Measurement, Scans, Segmentation
+from octoseg_ti.types import (
+    NONE,
+    Cells,
+    EdgeClass,
+    Measurement,
+    Scans,
+    Segmentation,
+    SurfaceKind,
+)
 
 # The line through two cells may leave the surface by half a tolerance.
 _CHORD = 0.5
@@ -37,9 +47,33 @@ _LIE_CELLS = 0.05
 _BEND_TOLERANCES = 2.0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Regions:
+    """Regions of cells, and the points that belong to them."""
+
+    touching: Adjacency
+    """The touching pairs of leaves."""
+    edge: np.ndarray
+    """`EdgeClass` of every leaf, shape (C,), u8."""
+    group: np.ndarray
+    """Group of every node that the flood fill reached, -1 = none, shape (M,), i32."""
+    cell_label: np.ndarray
+    """Region of every node, 0..K-1, -1 = none, shape (M,), i32."""
+    label: np.ndarray
+    """Region of every sorted point, 0..K-1, -1 = none, shape (n,), i32."""
+    count: int
+    """Number of regions K."""
+    surface: np.ndarray | None = None
+    """Analytic surface of every region, -1 = none, shape (K,), i32; None = not looked for."""
+    kind: np.ndarray | None = None
+    """`SurfaceKind` of every such surface."""
+    parameters: np.ndarray | None = None
+    """Parameters of every such surface, relative to the corner of the grid."""
+
+
 def grow_regions(
     grid: Grid, leaves: np.ndarray, edge: np.ndarray, measured: Measurement, params: Params
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> Regions:
     """Grow regions over the leaves, judge them, and hand out the points.
 
     Args:
@@ -50,9 +84,8 @@ def grow_regions(
         params: Parameters, all filled in.
 
     Returns:
-        The edge class of every leaf, with the strips along edges (sharp) and the bends (fillet)
-        that were found on the way; the label of every node, and that of every sorted point, -1
-        where there is no patch.
+        The regions; the edge class knows of the strips along edges (sharp) and of the bends
+        (fillet) that were found on the way.
     """
     assert params.regions.homogeneity is not None and params.regions.min_points is not None
     assert params.grid.edge_tolerance is not None
@@ -69,7 +102,8 @@ def grow_regions(
     min_points = params.regions.min_points
     if literal or not params.regions.assign_edges:
         cell_label = number_groups(grid, group, min_points)
-        return edge, cell_label, points_of_leaves(grid, leaves, cell_label[leaves])
+        label = points_of_leaves(grid, leaves, cell_label[leaves])
+        return _regions(touching, edge, group, cell_label, label)
     whole = group
     group = split_at_bends(
         grid,
@@ -90,6 +124,7 @@ def grow_regions(
     # Groups that larger ones explain are no patches: strips along an edge, and bends that are as
     # flat as the face beside them. What is left of them stands for itself.
     group[bend] = flood_fill(grid, touching, bend, **rule)[bend]
+    grown = group.copy()
     number = number_groups(grid, group, min_points)
     doubtful = (strips(grid, touching, group) | bend) & (number >= 0)
     cell_label = np.where(doubtful, NONE, number)
@@ -112,7 +147,20 @@ def grow_regions(
         edge = np.where(edge == int(EdgeClass.NONE), found[leaves], edge)
         cell_label = number_groups(grid, group, min_points)
     label = assign_points(grid, leaves, cell_label, bend=bend, **fit)
-    return edge, cell_label, label
+    return _regions(touching, edge, grown, cell_label, label)
+
+
+def _regions(
+    touching: Adjacency,
+    edge: np.ndarray,
+    group: np.ndarray,
+    cell_label: np.ndarray,
+    label: np.ndarray,
+) -> Regions:
+    count = int(cell_label.max(initial=NONE)) + 1
+    return Regions(
+        touching=touching, edge=edge, group=group, cell_label=cell_label, label=label, count=count
+    )
 
 
 def assemble(
@@ -122,29 +170,28 @@ def assemble(
     normal: np.ndarray,
     grid: Grid,
     leaves: np.ndarray,
-    edge: np.ndarray,
-    cell_label: np.ndarray,
-    label: np.ndarray,
+    found: Regions,
     measured: Measurement,
     params: Params,
 ) -> Segmentation:
-    """Number the patches by size, find the planes, and bring all into the input order."""
+    """Number the patches by size, describe their surfaces, and bring all into the input order."""
     node = runtime.download(grid.node)[: grid.count]
-    patches = int(cell_label.max(initial=NONE)) + 1
-    size = _sizes(grid, leaves, cell_label[leaves], label, patches)
+    patches = found.count
+    size = np.bincount(found.label[found.label >= 0], minlength=patches)
     rank = np.argsort(-size, kind="stable")
     name = np.full(patches + 1, NONE, np.int32)
     name[rank] = np.arange(patches, dtype=np.int32)
-    cell_label = name[cell_label]
-    flat = 2.0 * measured.noise + 0.02 * spacing_of(measured)
-    kind, parameters, residual = fit_planes(grid, leaves, cell_label[leaves], patches, limit=flat)
+    kind, parameters, residual, surface = _describe(grid, leaves, found, measured)
     n = len(scans)
     outlier = np.zeros(n, np.uint8)
     if not arranged.whole:
         outlier[:] = 1
         outlier[arranged.row] = 0
     left_out = np.flatnonzero(outlier)
-    rows = to_rows(grid, leaves, edge, label, name[:patches], point, normal, arranged.row, left_out)
+    rows = to_rows(
+        grid, leaves, found.edge, found.label, name[:patches], point, normal, arranged.row,
+        left_out,
+    )  # fmt: skip
     rows.points[left_out] = scans_in_world(scans, left_out)
     mean = runtime.download(grid.mean)[leaves]
     cells = Cells(
@@ -155,28 +202,54 @@ def assemble(
         normal=mean[:, NORMAL : NORMAL + 3].astype(np.float32),
         sigma=mean[:, SIGMA].astype(np.float32),
         stop=node[leaves, STOP].astype(np.uint8),
-        edge=edge,
-        label=cell_label[leaves],
+        edge=found.edge,
+        label=name[found.cell_label[leaves]],
         initial_size=grid.size,
     )
     return Segmentation(
         points=rows.points, normals=rows.normals, labels=rows.labels, edge=rows.edge,
-        level=rows.level, outlier=outlier, kind=kind, surface=np.arange(patches, dtype=np.int32),
-        parameters=parameters, residual=residual, cells=cells, stripe=scans.stripe,
-        view=scans.view, params=params, measured=measured, passes=grid.passes, name=scans.name,
+        level=rows.level, outlier=outlier, kind=kind[rank],
+        surface=_renumbered(surface[rank]), parameters=parameters[rank], residual=residual[rank],
+        cells=cells, stripe=scans.stripe, view=scans.view, params=params, measured=measured,
+        passes=grid.passes, name=scans.name,
     )  # fmt: skip
 
 
-def _sizes(
-    grid: Grid, leaves: np.ndarray, leaf_label: np.ndarray, label: np.ndarray, patches: int
-) -> np.ndarray:
-    """Return the points of every patch; in most cells all points have the label of the cell."""
-    inside = leaf_label >= 0
-    whole = np.bincount(
-        leaf_label[inside], weights=grid.holds[leaves[inside]], minlength=patches
-    ).astype(np.int64)
-    rest = label[points_in(grid, leaves[~inside])]
-    return whole + np.bincount(rest[rest >= 0], minlength=patches)
+def _describe(
+    grid: Grid, leaves: np.ndarray, found: Regions, measured: Measurement
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return kind, parameters, residual and surface of every region."""
+    patches = found.count
+    flat = 2.0 * measured.noise + 0.02 * spacing_of(measured)
+    cell_label = found.cell_label[leaves]
+    kind, parameters, residual = fit_planes(grid, leaves, cell_label, patches, limit=flat)
+    surface = np.arange(patches, dtype=np.int32)
+    if found.surface is None or found.kind is None or found.parameters is None:
+        return kind, parameters, residual, surface
+    kind[kind == int(SurfaceKind.NONE)] = int(SurfaceKind.FREE_FORM)
+    on = np.flatnonzero(found.surface >= 0)
+    which = found.surface[on]
+    kind[on], parameters[on] = found.kind[which], found.parameters[which]
+    parameters[on, :3] += grid.corner
+    surface[on] = which
+    surface[found.surface < 0] = len(found.kind) + np.arange(patches - len(on))
+    lying = found.label >= 0
+    lying[lying] = found.surface[found.label[lying]] >= 0
+    region = found.label[lying]
+    far, _ = evaluate_surfaces(
+        runtime.download(grid.point)[lying], found.surface[region], found.kind, found.parameters
+    )
+    count = np.maximum(np.bincount(region, minlength=patches), 1)
+    residual[on] = np.sqrt(np.bincount(region, far**2, patches) / count)[on]
+    return kind, parameters, residual, surface
+
+
+def _renumbered(surface: np.ndarray) -> np.ndarray:
+    """Number surfaces in the order in which they come up, shape (K,), i32."""
+    _, first, index = np.unique(surface, return_index=True, return_inverse=True)
+    order = np.empty(len(first), np.int32)
+    order[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
+    return order[index]
 
 
 def scans_in_world(scans: Scans, rows: np.ndarray) -> np.ndarray:

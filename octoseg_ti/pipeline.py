@@ -12,8 +12,8 @@ from octoseg_ti.arrange import Arranged, arrange, as_scans, without
 from octoseg_ti.defaults import derive
 from octoseg_ti.device import runtime
 from octoseg_ti.device.profiling import Trace
-from octoseg_ti.params import Params, preset_params
-from octoseg_ti.patches import assemble, grow_regions
+from octoseg_ti.params import Params, SurfaceParams, preset_params
+from octoseg_ti.patches import Regions, assemble, grow_regions
 from octoseg_ti.stages.cleaning import mark_outliers
 from octoseg_ti.stages.edges import edges_by_level, edges_by_radius, edges_by_reason
 from octoseg_ti.stages.filtering import filter_normals, independent_lag, square_lag
@@ -24,9 +24,14 @@ from octoseg_ti.stages.neighbors import neighbor_normals
 from octoseg_ti.stages.normals import edge_pair_normals
 from octoseg_ti.stages.refinement import refine_poses
 from octoseg_ti.stages.registration import to_world
+from octoseg_ti.stages.scatter import surface_noise
+from octoseg_ti.surfacing import fit_surfaces
 from octoseg_ti.types import Measurement, Registration, Scans, Segmentation
 
-STAGES = ("cleaning", "normals", "registration", "measure", "grid", "edges", "regions", "patches")
+STAGES = (
+    "cleaning", "normals", "registration", "measure", "grid", "edges", "regions", "surfaces",
+    "patches",
+)  # fmt: skip
 """The stages, in order."""
 
 # A cell bends away from its mean plane by 0.13 tolerance times its size at most while its normals
@@ -85,17 +90,19 @@ def segment(
         point, normal, aligned = register(scans, arranged, normal, measured, params)
     with stage("measure"):
         measured = measure_noise(arranged, point, normal, measured, params)
-        params = derive(params, measured)
+        asked, params = params.surfaces, derive(params, measured)
     with stage("grid"):
         signed = arranged.run is not None or scans.normals is not None
         grid = subdivide(point, normal, measured, params, signed)
     with stage("edges"):
         leaves, edge = find_edges(grid, params)
     with stage("regions"):
-        edge, cell_label, label = grow_regions(grid, leaves, edge, measured, params)
+        found = grow_regions(grid, leaves, edge, measured, params)
+    with stage("surfaces"):
+        measured, params, found = explain_regions(grid, leaves, found, measured, params, asked)
     with stage("patches"):
         result = assemble(
-            scans, arranged, point, normal, grid, leaves, edge, cell_label, label, measured, params
+            scans, arranged, point, normal, grid, leaves, found, measured, params
         )
     if aligned is not None:
         result = with_registration(result, scans, aligned)
@@ -270,6 +277,22 @@ def subdivide(
         noise=measured.noise,
         signed=signed,
     )
+
+
+def explain_regions(
+    grid: Grid,
+    leaves: np.ndarray,
+    found: Regions,
+    measured: Measurement,
+    params: Params,
+    asked: SurfaceParams,
+) -> tuple[Measurement, Params, Regions]:
+    """Find the analytic surfaces of the regions, and give the points to them."""
+    if not params.surfaces.enabled:
+        return measured, params, found
+    measured = replace(measured, surface_noise=surface_noise(grid))
+    params = derive(replace(params, surfaces=asked), measured)
+    return measured, params, fit_surfaces(grid, leaves, found, params)
 
 
 def find_edges(grid: Grid, params: Params) -> tuple[np.ndarray, np.ndarray]:

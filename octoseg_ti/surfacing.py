@@ -7,12 +7,15 @@ surfaces that are one are merged, and surfaces that their neighbours explain are
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from octoseg_ti.defaults import TURNS
 from octoseg_ti.device import runtime
 from octoseg_ti.device.unionfind import components
+from octoseg_ti.params import Params
+from octoseg_ti.patches import Regions
 from octoseg_ti.stages.extraction import (
     Surfaces,
     Tolerance,
@@ -23,8 +26,16 @@ from octoseg_ti.stages.extraction import (
     spread,
 )
 from octoseg_ti.stages.grid import Grid
-from octoseg_ti.stages.labelling import Choice, Rule, label_points, own_lists, surface_table
-from octoseg_ti.stages.leaves import Leaves, Samples, sample_leaves
+from octoseg_ti.stages.labelling import (
+    Choice,
+    Rule,
+    common_label,
+    label_lists,
+    label_points,
+    own_lists,
+    surface_table,
+)
+from octoseg_ti.stages.leaves import Leaves, Samples, leaf_graph, sample_leaves
 from octoseg_ti.stages.merging import (
     contacts,
     explained_by_others,
@@ -44,6 +55,8 @@ _REFIT = 300
 # A surface is given up when its neighbours explain its points with this mean square, in noises.
 _EXPLAINED = 2.0
 _MERGES = 3
+# A point that fits nothing joins a patch within so many times the usual reach.
+_LOOSE = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -205,6 +218,57 @@ def find_surfaces(
         if not search.give_up() and not merged:
             break
     return Surfaced(surfaces=search.surfaces, label=search.label, own=search.own)
+
+
+def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params) -> Regions:
+    """Explain regions by analytic surfaces, and give the points to these.
+
+    Args:
+        grid: The sparse grid.
+        leaves: The nodes that are leaves, in Morton order, shape (C,).
+        found: The regions of the flood fill. Those that no analytic surface explains are kept.
+        params: Parameters, all filled in.
+    """
+    noise, tilt = params.surfaces.noise, params.surfaces.tilt
+    least = params.regions.min_points
+    assert noise is not None and tilt is not None and least is not None
+    graph = leaf_graph(grid, leaves.astype(np.int32), found.touching)
+    turn = max(TURNS[0], TURNS[1] * tilt)
+    rule = Rule(noise, tilt)
+    surfaced = find_surfaces(
+        grid, graph, found.group[leaves], Tolerance(noise, turn, least), rule
+    )
+    label, surface = number_pieces(graph, surfaced, least)
+    # Regions of which surfaces explain less than half stay; they are free forms.
+    rest = (label < 0) & (found.label >= 0)
+    size = np.bincount(found.label[found.label >= 0], minlength=found.count)
+    left = np.bincount(found.label[rest], minlength=found.count)
+    stay = np.flatnonzero((2 * left >= size) & (left >= least))
+    number = np.full(found.count + 1, NONE, np.int32)
+    number[stay] = len(surface) + np.arange(len(stay), dtype=np.int32)
+    label[rest] = number[found.label[rest]]
+    # What is left joins the nearest patch, within reason.
+    if np.any(label < 0) and len(surface):
+        table = surface_table(
+            surfaced.surfaces.kind[surface],
+            surfaced.surfaces.parameters[surface],
+            np.zeros(len(surface)),
+        )
+        loose = rule._replace(reach=_LOOSE * rule.reach, turn=float(np.pi))
+        own = label_lists(graph, np.where(label < len(surface), label, NONE))
+        choice, _ = label_points(grid, graph, own, table, loose)
+        label = np.where(label < 0, runtime.download(choice.label), label)
+    held = np.full(grid.count, NONE, np.int32)
+    held[leaves] = common_label(graph, label)
+    return replace(
+        found,
+        label=label,
+        cell_label=np.where(found.cell_label >= 0, held, NONE).astype(np.int32),
+        count=len(surface) + len(stay),
+        surface=np.concatenate([surface, np.full(len(stay), NONE, np.int32)]),
+        kind=surfaced.surfaces.kind,
+        parameters=surfaced.surfaces.parameters,
+    )
 
 
 def number_pieces(leaves: Leaves, found: Surfaced, least: float) -> tuple[np.ndarray, np.ndarray]:

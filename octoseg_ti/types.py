@@ -188,6 +188,9 @@ class Measurement:
     """Estimated standard deviation of the range noise [mm]."""
     normal_noise: float
     """Estimated deviation of a point normal from the surface normal [rad]."""
+    surface_noise: float = 0.0
+    """Estimated standard deviation of points about the smooth surface through their neighbourhood
+    [mm]: noise, and what neighbours share of it; 0 = not measured."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -168,6 +168,36 @@ def own_lists(leaves: Leaves, leaf: np.ndarray, label: np.ndarray) -> np.ndarray
     return own
 
 
+def common_label(leaves: Leaves, label: np.ndarray) -> np.ndarray:
+    """Return the label that all points of a leaf have, -1 where they differ; shape (C,), i32."""
+    low = np.minimum.reduceat(label, leaves.first)
+    high = np.maximum.reduceat(label, leaves.first)
+    return np.where(low == high, low, NONE).astype(np.int32)
+
+
+def label_lists(leaves: Leaves, label: np.ndarray) -> np.ndarray:
+    """Return which labels the points of every leaf have.
+
+    Args:
+        leaves: The leaves.
+        label: Label of every sorted point, -1 = none, shape (n,), i32.
+
+    Returns:
+        Labels of every leaf, ascending, then -1; shape (C, MOST), i32.
+    """
+    one = common_label(leaves, label)
+    mixed = np.flatnonzero(one < 0)
+    count = leaves.count[mixed]
+    ends = np.cumsum(count)
+    point = np.arange(ends[-1] if len(ends) else 0)
+    point = point + np.repeat(leaves.first[mixed] - (ends - count), count)
+    return own_lists(
+        leaves,
+        np.concatenate([np.flatnonzero(one >= 0), np.repeat(mixed, count)]),
+        np.concatenate([one[one >= 0], label[point]]),
+    )
+
+
 def surface_table(kind: np.ndarray, parameters: np.ndarray, side: np.ndarray) -> np.ndarray:
     """Return surfaces as rows for kernels: parameters (8), kind, and side, shape (M, 10).
 

@@ -1,0 +1,44 @@
+"""How far points scatter about the smooth surface through their neighbourhood.
+
+Second differences along a stripe see what two neighbours do not share. What decides whether a point
+lies on a surface is more than that: steps of the range, speckle over several points, views that do
+not quite meet. It is measured where it matters, as the residual of the best analytic surface
+through neighbourhoods of about a hundred points, taken at the calmest quarter of them.
+"""
+
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.stages.grid import Grid
+from octoseg_ti.stages.primitives import FREEDOM, fit_all
+
+# Neighbourhoods, and the points of each.
+_COUNT, _POINTS = 256, 128
+_FEWEST = 24
+_CALM = 0.25
+
+
+def surface_noise(grid: Grid) -> float:
+    """Return the standard deviation of points about the surface through their neighbourhood [mm].
+
+    Args:
+        grid: The sparse grid: points that follow one another in Morton order are near each other.
+    """
+    key = runtime.download(grid.key)
+    n = len(key)
+    begin = np.unique(np.arange(_COUNT) * n // _COUNT)
+    # Whole boxes: which points of a box come first would depend on the order of the input.
+    first = np.searchsorted(key, key[begin])
+    last = np.searchsorted(key, key[np.minimum(first + _POINTS, n - 1)])
+    fits = (last - first >= _FEWEST) & (last - first <= 4 * _POINTS)
+    first, count = np.unique(first[fits], return_index=True)
+    count = last[fits][count] - first
+    if len(first) == 0:
+        return 0.0
+    ends = np.cumsum(count)
+    index = np.arange(ends[-1]) + np.repeat(first - (ends - count), count)
+    point, normal = runtime.download(grid.point)[index], runtime.download(grid.normal)[index]
+    fit = fit_all(point, normal, None, np.concatenate([[0], ends]).astype(np.int32))
+    spare = count[:, None] / (count[:, None] - FREEDOM[None, :])
+    rms = np.where(np.isfinite(fit.rms), fit.rms * np.sqrt(spare), np.inf).min(axis=1)
+    return float(np.quantile(rms, _CALM))
