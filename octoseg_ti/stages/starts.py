@@ -15,13 +15,12 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import mat3, row, vec2, vec3
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, ti
 from octoseg_ti.device.surfaces import CONE, CYLINDER, KINDS, PLANE, SPHERE, TORUS
+from octoseg_ti.stages.motions import STATE
 
 _DIRECTIONS = 5  # tried as axis
 _FAR = 1e3  # no start is farther from the points than this, in units of their extent
+_LEAST = 1e-2  # the smallest ring to start from, in extents: at none, nothing would move it
 _RIDGE = 1e-6  # of the mean square of the normals: keeps what they leave open near the points
-
-STATE = 11
-"""Numbers of a state: point (3), axis (3), a direction across it (3), shape (2)."""
 
 
 class Moments(NamedTuple):
@@ -237,6 +236,11 @@ def _limited(v: np.ndarray) -> np.ndarray:
     return v * np.minimum(1.0, _FAR / np.maximum(size, 1e-300))
 
 
+def _toward(v: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """Return directions of vectors; the other ones where a vector is too short to have any."""
+    return np.where(np.linalg.norm(v, axis=-1, keepdims=True) > 1e-6, _unit(v), otherwise)
+
+
 def across(axis: np.ndarray) -> np.ndarray:
     """Return a unit vector at right angles to each axis, shape (..., 3)."""
     other = np.where(np.abs(axis[..., :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
@@ -398,7 +402,12 @@ def starts(
     ring, height, tube, square = _circles(f, middle)
     place(TORUS, square, height, ring, tube)
     state[:, SPHERE, :3], state[:, SPHERE, 9] = _spheres(m)
-    state[:, SPHERE, 5] = 1.0
     state[:, PLANE, 3:6] = np.linalg.eigh(np.nan_to_num(m.qq))[1][:, :, 0]
-    state[:, :, 6:9] = across(state[:, :, 3:6])
+    # Towards the points, which are about the origin.
+    toward = -state[:, :, :3]
+    state[:, SPHERE, 3:6] = _toward(toward[:, SPHERE], across(toward[:, SPHERE]))
+    state[:, TORUS, 9] = np.maximum(state[:, TORUS, 9], _LEAST)
+    axis = state[:, :, 3:6]
+    toward = toward - np.sum(toward * axis, axis=-1, keepdims=True) * axis
+    state[:, :, 6:9] = _toward(toward, across(axis))
     return state
