@@ -248,7 +248,19 @@ class _Run:
         self.data, self.groups, self.count = data, len(count), count
         self.work = np.zeros((self.groups * KINDS, _WORK))
         self.work[:, :STATE] = state.reshape(-1, STATE)
-        self.going = np.repeat(count > 0, KINDS).reshape(-1, KINDS)
+        self.work[:, _COST] = np.inf
+        self.going = np.isfinite(state[..., 0]) & (count > 0)[:, None]
+
+    @property
+    def cost(self) -> np.ndarray:
+        """Sums of squares, (G, KINDS); infinite where there was nothing to start from."""
+        return self.work[:, _COST].reshape(self.groups, KINDS)
+
+    def take(self, other: "_Run") -> None:
+        """Take over what another run has fitted better."""
+        better = other.cost < 0.999 * self.cost
+        self.work[better.ravel()] = other.work[better.ravel()]
+        self.going |= better
 
     def improve(self, every: np.ndarray, rounds: int) -> None:
         """Let what moves come to rest, seen by every so manieth point of its group."""
@@ -269,8 +281,7 @@ class _Run:
             _linearise(len(active), stride, listed, *data, device)
             _step(len(active), stride, listed, device)
             self.work = runtime.download(device)[: self.groups * KINDS]
-            shaped = self.work.reshape(self.groups, KINDS, _WORK)
-            cost, gain = shaped[..., _COST], shaped[..., _GAIN]
+            cost, gain = self.cost, self.work[:, _GAIN].reshape(self.groups, KINDS)
             rest = (gain * seen <= _REST) | (cost <= _EXACT * seen)
             if k >= _PATIENCE and not self.all_kinds:
                 slow = gain < 0.1
@@ -306,7 +317,8 @@ def iterate(
         frame: Centre [mm] and 1 / extent of every group, shape (G, 4), f64.
         reach: Distance at which the weight of a point ends, in extents, shape (G, KINDS);
             infinite = least squares.
-        state: Where to start, shape (G, KINDS, STATE), as of `starts`.
+        state: Where to start, shape (T, G, KINDS, STATE): the first try, and others for what may
+            come to rest in a wrong place; NaN = none.
         rounds: Most passes over the points, of either sort.
         all_kinds: Leave none; what a robust fit needs, as outliers can favour the wrong kind.
 
@@ -318,10 +330,17 @@ def iterate(
     groups, count = len(start) - 1, np.diff(start)
     flat = np.ascontiguousarray(reach.reshape(groups * KINDS))
     data = [runtime.upload(a) for a in (points, weight, start, frame, flat)]
-    run = _Run(data, state, count, bool(np.isfinite(flat).any()), all_kinds)
+    robust = bool(np.isfinite(flat).any())
+    run = _Run(data, state[0], count, robust, all_kinds)
     every = np.maximum(count // _SOME, 1).astype(np.int32)
-    if np.any(every > 1):
+    if np.any(every > 1) or len(state) > 1:
         run.improve(every, rounds)
+    for again in state[1:]:
+        other = _Run(data, again, count, robust, True)
+        flat_enough = run.cost[:, PLANE] <= _LEAVE * run.cost.min(axis=1)
+        other.going &= ~flat_enough[:, None] | all_kinds
+        other.improve(every, rounds)
+        run.take(other)
     run.improve(np.ones(groups, np.int32), rounds)
     work = run.work.reshape(groups, KINDS, _WORK)
     normal = np.zeros((groups, KINDS, UNKNOWNS, UNKNOWNS))

@@ -271,7 +271,7 @@ def fit_all(
             spread = np.repeat(spread.min(axis=1, keepdims=True), KINDS, axis=1)
         reach = TUKEY * np.maximum(spread, scale)
         state, normal = iterate(
-            *given, reach / extent[:, None], state, rounds=_ROUNDS, all_kinds=True
+            *given, reach / extent[:, None], state[None], rounds=_ROUNDS, all_kinds=True
         )
     parameters = to_parameters(state, m.centre, extent)
     sums = samples.sums(parameters, reach)
