@@ -26,6 +26,7 @@ from octoseg_ti.stages.motions import (
     STATE,
     UNKNOWNS,
     anchor_radius,
+    bounded,
     change_of_distance,
     is_free,
     step_state,
@@ -177,6 +178,7 @@ def _try_step(kind: ti.i32, work: ti.template(), t: ti.i32):
     step = vec7(0.0)
     for k in ti.static(range(7)):
         step[k] = work[t, _STEP + k]
+    step = bounded(kind, step)
     shape = _shape(kind, work, t, 0)
     origin, axis, u, a, b = step_state(
         kind, _triple(work, t, 0), _triple(work, t, 3), _triple(work, t, 6), shape, step

@@ -29,8 +29,9 @@ from octoseg_ti.device.surfaces import (
 
 UNKNOWNS = 7
 """Shift along u and along the axis, turns about u, v = axis x u and the axis, relative change of
-the curvature at the anchor (its sign turned, so that the radius grows), and half angle of a cone
-or tube radius of a torus."""
+the curvature at the anchor (its sign turned, so that the radius grows), and the tube radius of a
+torus. A cone with half angle h at the distance r from its axis has the curvature cos h / r and the
+taper sin h / r, and these two change, in units of 1 / r, while the line through the anchor stays."""
 
 FREE = np.zeros((KINDS, UNKNOWNS), bool)
 """The unknowns that move a surface of every kind."""
@@ -43,8 +44,8 @@ FREE[TORUS] = True
 STATE = 11
 """Numbers of a state."""
 
-_AROUND = 0.9  # of the way to zero curvature: the most that a step goes
-_TIGHTER = 9.0  # and the most that it goes the other way
+_TURN = 0.5  # the most that a step turns [rad], opens or bends: derivatives hold no farther
+_GROWTH = 0.75  # the largest relative change of a curvature
 
 vec7 = ti.types.vector(7, ti.f64)
 
@@ -90,24 +91,53 @@ def change_of_distance(kind: ti.i32, q: vec3, shape: vec4, anchor: ti.f64):
     arm = vec3(q[0] - anchor, q[1], q[2])
     bend = anchor * (n[0] - f[1])
     other = -1.0
-    if kind == CONE:
-        other = -(rho - anchor) * shape[3] - q[2] * shape[2]
-    elif kind == SPHERE:
+    if kind == SPHERE:
         arm = vec3(q[0], q[1], q[2] - anchor)
         bend = anchor * (n[2] - 1.0)
     turned = arm.cross(n)
+    if kind == CONE:
+        # A larger half angle, with the axis turned so that the line through the anchor stays.
+        open_up = turned[1] - (rho - anchor) * shape[3] - q[2] * shape[2]
+        other = shape[2] * open_up - shape[3] * bend
+        bend = shape[2] * bend + shape[3] * open_up
     return f[0], vec7(-n[0], -n[2], -turned[0], -turned[1], -turned[2], bend, other)
+
+
+@ti.func
+def bounded(kind: ti.i32, step: vec7) -> vec7:
+    """Return the step, shortened as a whole where it turns or bends more than can be foretold."""
+    most = ti.max(ti.abs(step[2]), ti.abs(step[3]), ti.abs(step[4])) / _TURN
+    most = ti.max(most, ti.abs(step[5]) / _GROWTH)
+    if kind == CONE:
+        most = ti.max(most, ti.abs(step[6]) / _TURN)
+    return step / ti.max(most, 1.0)
+
+
+@ti.func
+def _turned(x: vec3, turn: vec3) -> vec3:
+    """Return a vector turned about an axis by its length (Rodrigues)."""
+    angle = turn.norm()
+    about = turn / ti.max(angle, 1e-300)
+    along = about.dot(x) * about
+    return along + ti.cos(angle) * (x - along) + ti.sin(angle) * about.cross(x)
 
 
 @ti.func
 def step_state(kind: ti.i32, point: vec3, axis: vec3, u: vec3, shape: vec4, step: vec7):
     """Return (point, axis, u, a, b) after a step."""
     v = axis.cross(u)
-    turn = step[2] * u + step[3] * v + step[4] * axis
     radius = anchor_radius(kind, point, axis, shape)
-    grown = radius / (1.0 - ti.min(ti.max(step[5], -_TIGHTER), _AROUND))
-    to_axis = (axis + turn.cross(axis)).normalized()
-    to_u = u + turn.cross(u)
+    flatter = 1.0 - step[5]
+    opened = 0.0
+    if kind == CONE:
+        bend = shape[2] - step[5]
+        taper = shape[3] + step[6]
+        opened = ti.atan2(taper * shape[2] - bend * shape[3], bend * shape[2] + taper * shape[3])
+        flatter = ti.sqrt(bend * bend + taper * taper)
+    grown = radius / flatter
+    turn = step[2] * u + (step[3] - opened) * v + step[4] * axis
+    to_axis = _turned(axis, turn).normalized()
+    to_u = _turned(u, turn)
     to_u = (to_u - to_u.dot(to_axis) * to_axis).normalized()
     shifted = point + step[0] * u + step[1] * axis
     a = grown
@@ -119,7 +149,7 @@ def step_state(kind: ti.i32, point: vec3, axis: vec3, u: vec3, shape: vec4, step
     if kind == PLANE:
         a = 0.0
     elif kind == CONE:
-        a = shape[0] + step[6]
+        a = shape[0] + opened
         b = shape[1] - radius * shape[2] + grown * ti.cos(a)
     elif kind == TORUS:
         b = shape[1] + step[6]
@@ -138,11 +168,25 @@ def moved(state: np.ndarray, step: np.ndarray) -> np.ndarray:
     """
     point, axis, u = state[..., :3], state[..., 3:6], state[..., 6:9]
     v = np.cross(axis, u)
-    turn = step[..., 2, None] * u + step[..., 3, None] * v + step[..., 4, None] * axis
+    half = state[:, CONE, 9]
+    bend, taper = np.cos(half) - step[:, CONE, 5], np.sin(half) + step[:, CONE, 6]
+    opened = np.zeros(step.shape[:2])
+    opened[:, CONE] = np.angle((bend + 1j * taper) * np.exp(-1j * half))
+    flatter = 1.0 - step[..., 5]
+    flatter[:, CONE] = np.hypot(bend, taper)
     radius = _anchor_radii(state)
-    grown = radius / (1.0 - np.clip(step[..., 5], -_TIGHTER, _AROUND))
-    to_axis = _unit(axis + np.cross(turn, axis))
-    to_u = u + np.cross(turn, u)
+    grown = radius / flatter
+    turn = (
+        step[..., 2, None] * u + (step[..., 3] - opened)[..., None] * v + step[..., 4, None] * axis
+    )
+    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
+    about = turn / np.maximum(angle, 1e-300)
+
+    def turned(x: np.ndarray) -> np.ndarray:
+        along = np.sum(about * x, axis=-1, keepdims=True) * about
+        return along + np.cos(angle) * (x - along) + np.sin(angle) * np.cross(about, x)
+
+    to_axis, to_u = _unit(turned(axis)), turned(u)
     to_u = _unit(to_u - np.sum(to_u * to_axis, axis=-1, keepdims=True) * to_axis)
     shifted = point + step[..., 0, None] * u + step[..., 1, None] * axis
     before, after = u.copy(), to_u.copy()
@@ -150,10 +194,9 @@ def moved(state: np.ndarray, step: np.ndarray) -> np.ndarray:
     shifted += radius[..., None] * before - grown[..., None] * after
     shape = np.stack((grown, state[..., 10]), axis=-1)
     shape[:, PLANE] = 0.0
-    angle = state[:, CONE, 9]
-    shape[:, CONE, 0] = angle + step[:, CONE, 6]
+    shape[:, CONE, 0] = half + opened[:, CONE]
     shape[:, CONE, 1] += grown[:, CONE] * np.cos(shape[:, CONE, 0])
-    shape[:, CONE, 1] -= radius[:, CONE] * np.cos(angle)
+    shape[:, CONE, 1] -= radius[:, CONE] * np.cos(half)
     shape[:, TORUS, 1] += step[:, TORUS, 6]
     return np.concatenate((shifted, to_axis, to_u, shape), axis=-1)
 
