@@ -1,8 +1,7 @@
 """Moves surfaces until the squares of the orthogonal distances of points to them are least.
 
 Levenberg-Marquardt (Marquardt 1963), one surface a task and serial inside, so that no sum depends
-on threads. All kinds share one set of seven unknowns: a shift of the surface (3), two turns that
-tilt its axis, two numbers of its shape; a kind leaves out those that do not move it.
+on threads.
 """
 
 from typing import Any
@@ -20,19 +19,19 @@ from octoseg_ti.device.surfaces import (
     SPHERE,
     TORUS,
     cone_shape,
-    profile,
     vec4,
 )
-from octoseg_ti.stages.starts import STATE
-
-UNKNOWNS = 7
-FREE = np.zeros((KINDS, UNKNOWNS), bool)
-"""Which unknowns move a surface of every kind: shift u, v, axis; turn u, v; shape a, b."""
-FREE[PLANE, [2, 3, 4]] = True
-FREE[CYLINDER, [0, 1, 3, 4, 5]] = True
-FREE[CONE, [0, 1, 3, 4, 5, 6]] = True
-FREE[SPHERE, [0, 1, 2, 5]] = True
-FREE[TORUS] = True
+from octoseg_ti.stages.motions import (
+    FREE,
+    STATE,
+    UNKNOWNS,
+    anchor_radius,
+    bounded,
+    change_of_distance,
+    is_free,
+    step_state,
+    vec7,
+)
 
 _SOME = 100  # points that the first passes look at
 _PATIENCE = 3  # passes before a kind may be left
@@ -51,23 +50,7 @@ _STEP = _FACTOR + 28
 _DAMPING, _GAIN = _STEP + UNKNOWNS, _STEP + UNKNOWNS + 1
 _WORK = _GAIN + 1
 
-vec7 = ti.types.vector(7, ti.f64)
 vec28 = ti.types.vector(28, ti.f64)
-
-
-@ti.func
-def _free(kind: ti.i32, k: ti.i32) -> ti.i32:
-    """Return 1 if unknown ``k`` moves a surface of this kind; bits in the order of `FREE`."""
-    bits = 127
-    if kind == PLANE:
-        bits = 0b0011100
-    elif kind == CYLINDER:
-        bits = 0b0111011
-    elif kind == CONE:
-        bits = 0b1111011
-    elif kind == SPHERE:
-        bits = 0b0100111
-    return (bits >> k) & 1
 
 
 @ti.func
@@ -77,35 +60,12 @@ def _triple(rows: ti.template(), i: ti.i32, at: ti.i32) -> vec3:
 
 
 @ti.func
-def _placed(kind: ti.i32, frame: ti.template(), g: ti.i32, work: ti.template(), t: ti.i32):
-    """Return the state on trial: origin [mm], axis and two directions across [1/mm], shape."""
-    scale = frame[g, 3]
-    origin = row(frame, g) + _triple(work, t, _BLOCK) / scale
-    axis = scale * _triple(work, t, _BLOCK + 3)
-    u = _triple(work, t, _BLOCK + 6)
-    shape = vec4(work[t, _BLOCK + 9], work[t, _BLOCK + 10], 0.0, 0.0)
+def _shape(kind: ti.i32, work: ti.template(), t: ti.i32, at: ti.i32) -> vec4:
+    """Return the shape of the state in column ``at`` as `profile` reads it."""
+    shape = vec4(work[t, at + 9], work[t, at + 10], 0.0, 0.0)
     if kind == CONE:
         shape = cone_shape(shape[0], shape[1])
-    return origin, axis, scale * u, axis.cross(u), shape
-
-
-@ti.func
-def _row_of(kind: ti.i32, q: vec3, shape: vec4):
-    """Return the distance of a point in the surface's own frame and its change by the unknowns.
-
-    A surface that is shifted by s and turned by r moves away by n.s + r.(q x n).
-    """
-    rho = ti.sqrt(q[0] * q[0] + q[1] * q[1])
-    f = profile(kind, rho, q[2], shape)
-    c = f[1] / ti.max(rho, 1e-12)
-    by_a = -1.0
-    if kind == CONE:
-        by_a = -rho * shape[3] - q[2] * shape[2]
-    elif kind == TORUS:
-        by_a = -f[1]
-    n = vec3(c * q[0], c * q[1], f[2])
-    turned = q.cross(n)
-    return f[0], vec7(-n[0], -n[1], -n[2], -turned[0], -turned[1], by_a, -1.0)
+    return shape
 
 
 @ti.kernel
@@ -132,7 +92,16 @@ def _linearise(
             t = task_in[e // stride]
             kind = t % KINDS
             g = t // KINDS
-            origin, axis, u, v, shape = _placed(kind, frame_in, g, work_inout, t)
+            origin = _triple(work_inout, t, _BLOCK)
+            axis = _triple(work_inout, t, _BLOCK + 3)
+            u = _triple(work_inout, t, _BLOCK + 6)
+            shape = _shape(kind, work_inout, t, _BLOCK)
+            anchor = anchor_radius(kind, origin, axis, shape)
+            scale = frame_in[g, 3]
+            origin = row(frame_in, g) + origin / scale
+            axis = scale * axis
+            v = axis.cross(u)
+            u = scale * u
             reach = reach_in[t]
             first = start_in[g]
             every = every_in[g]
@@ -143,7 +112,7 @@ def _linearise(
                 i = first + k * every
                 p = row(point_in, i) - origin
                 local = vec3(p.dot(u), p.dot(v), p.dot(axis))
-                d, j = _row_of(kind, local, shape)
+                d, j = change_of_distance(kind, local, shape, anchor)
                 w = weight_in[i]
                 if reach < 1e300:
                     left = ti.max(1.0 - d * d / (reach * reach), 0.0)
@@ -170,7 +139,7 @@ def _solve_step(kind: ti.i32, damping: ti.f64, work: ti.template(), t: ti.i32):
         for b in range(a + 1):
             k = a * (a + 1) // 2 + b
             s = 0.0
-            if _free(kind, a) == 1 and _free(kind, b) == 1:
+            if is_free(kind, a) == 1 and is_free(kind, b) == 1:
                 s = work[t, _NORMAL + k]
             if a == b:
                 s = s * (1.0 + damping) + 1e-300
@@ -182,7 +151,7 @@ def _solve_step(kind: ti.i32, damping: ti.f64, work: ti.template(), t: ti.i32):
             if a == b:
                 # What no point holds is not moved.
                 whole = work[t, _NORMAL + k]
-                if _free(kind, a) == 0 or s <= 1e-14 * whole or s <= 1e-290:
+                if is_free(kind, a) == 0 or s <= 1e-14 * whole or s <= 1e-290:
                     s = 1e30
                 s = ti.sqrt(s)
             else:
@@ -190,7 +159,7 @@ def _solve_step(kind: ti.i32, damping: ti.f64, work: ti.template(), t: ti.i32):
             work[t, _FACTOR + k] = s
     for a in range(7):
         s = 0.0
-        if _free(kind, a) == 1:
+        if is_free(kind, a) == 1:
             s = -work[t, _GRADIENT + a]
         for c in range(a):
             s -= work[t, _FACTOR + a * (a + 1) // 2 + c] * work[t, _STEP + c]
@@ -206,16 +175,14 @@ def _solve_step(kind: ti.i32, damping: ti.f64, work: ti.template(), t: ti.i32):
 @ti.func
 def _try_step(kind: ti.i32, work: ti.template(), t: ti.i32):
     """Write the state that the step leads to, on trial; of infinite cost where it is none."""
-    origin = _triple(work, t, 0)
-    axis = _triple(work, t, 3)
-    u = _triple(work, t, 6)
-    v = axis.cross(u)
-    step = _triple(work, t, _STEP)
-    origin += step[0] * u + step[1] * v + step[2] * axis
-    axis = (axis + work[t, _STEP + 4] * u - work[t, _STEP + 3] * v).normalized()
-    u = (u - axis.dot(u) * axis).normalized()
-    a = work[t, 9] + work[t, _STEP + 5]
-    b = work[t, 10] + work[t, _STEP + 6]
+    step = vec7(0.0)
+    for k in ti.static(range(7)):
+        step[k] = work[t, _STEP + k]
+    step = bounded(kind, step)
+    shape = _shape(kind, work, t, 0)
+    origin, axis, u, a, b = step_state(
+        kind, _triple(work, t, 0), _triple(work, t, 3), _triple(work, t, 6), shape, step
+    )
     for k in ti.static(range(3)):
         work[t, _BLOCK + k] = origin[k]
         work[t, _BLOCK + 3 + k] = axis[k]
@@ -223,7 +190,7 @@ def _try_step(kind: ti.i32, work: ti.template(), t: ti.i32):
     work[t, _BLOCK + 9] = a
     work[t, _BLOCK + 10] = b
     possible = origin.norm() <= _FAR and ti.abs(a) <= _FAR
-    if kind != CONE and (a < 0.0 or b < 0.0):
+    if kind == TORUS and b <= 0.0:
         possible = False
     work[t, _BLOCK + _COST] = 0.0
     if not possible:
@@ -283,7 +250,19 @@ class _Run:
         self.data, self.groups, self.count = data, len(count), count
         self.work = np.zeros((self.groups * KINDS, _WORK))
         self.work[:, :STATE] = state.reshape(-1, STATE)
-        self.going = np.repeat(count > 0, KINDS).reshape(-1, KINDS)
+        self.work[:, _COST] = np.inf
+        self.going = np.isfinite(state[..., 0]) & (count > 0)[:, None]
+
+    @property
+    def cost(self) -> np.ndarray:
+        """Sums of squares, (G, KINDS); infinite where there was nothing to start from."""
+        return self.work[:, _COST].reshape(self.groups, KINDS)
+
+    def take(self, other: "_Run") -> None:
+        """Take over what another run has fitted better."""
+        better = other.cost < 0.999 * self.cost
+        self.work[better.ravel()] = other.work[better.ravel()]
+        self.going |= better
 
     def improve(self, every: np.ndarray, rounds: int) -> None:
         """Let what moves come to rest, seen by every so manieth point of its group."""
@@ -304,8 +283,7 @@ class _Run:
             _linearise(len(active), stride, listed, *data, device)
             _step(len(active), stride, listed, device)
             self.work = runtime.download(device)[: self.groups * KINDS]
-            shaped = self.work.reshape(self.groups, KINDS, _WORK)
-            cost, gain = shaped[..., _COST], shaped[..., _GAIN]
+            cost, gain = self.cost, self.work[:, _GAIN].reshape(self.groups, KINDS)
             rest = (gain * seen <= _REST) | (cost <= _EXACT * seen)
             if k >= _PATIENCE and not self.all_kinds:
                 slow = gain < 0.1
@@ -316,18 +294,6 @@ class _Run:
                 rest |= left
             going &= ~rest
             going[:, PLANE] &= self.robust  # else its start is the solution
-
-
-def moved(state: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Return states after a step in the seven unknowns, shapes (..., STATE) and (..., 7)."""
-    point, axis, u = state[..., :3], state[..., 3:6], state[..., 6:9]
-    v = np.cross(axis, u)
-    point = point + step[..., 0, None] * u + step[..., 1, None] * v + step[..., 2, None] * axis
-    axis = axis + step[..., 4, None] * u - step[..., 3, None] * v
-    axis = axis / np.linalg.norm(axis, axis=-1, keepdims=True)
-    u = u - np.sum(u * axis, axis=-1, keepdims=True) * axis
-    u = u / np.linalg.norm(u, axis=-1, keepdims=True)
-    return np.concatenate((point, axis, u, state[..., 9:] + step[..., 5:]), axis=-1)
 
 
 def iterate(
@@ -353,7 +319,8 @@ def iterate(
         frame: Centre [mm] and 1 / extent of every group, shape (G, 4), f64.
         reach: Distance at which the weight of a point ends, in extents, shape (G, KINDS);
             infinite = least squares.
-        state: Where to start, shape (G, KINDS, STATE), as of `starts`.
+        state: Where to start, shape (T, G, KINDS, STATE): the first try, and others for what may
+            come to rest in a wrong place; NaN = none.
         rounds: Most passes over the points, of either sort.
         all_kinds: Leave none; what a robust fit needs, as outliers can favour the wrong kind.
 
@@ -365,10 +332,17 @@ def iterate(
     groups, count = len(start) - 1, np.diff(start)
     flat = np.ascontiguousarray(reach.reshape(groups * KINDS))
     data = [runtime.upload(a) for a in (points, weight, start, frame, flat)]
-    run = _Run(data, state, count, bool(np.isfinite(flat).any()), all_kinds)
+    robust = bool(np.isfinite(flat).any())
+    run = _Run(data, state[0], count, robust, all_kinds)
     every = np.maximum(count // _SOME, 1).astype(np.int32)
-    if np.any(every > 1):
+    if np.any(every > 1) or len(state) > 1:
         run.improve(every, rounds)
+    for again in state[1:]:
+        other = _Run(data, again, count, robust, True)
+        flat_enough = run.cost[:, PLANE] <= _LEAVE * run.cost.min(axis=1)
+        other.going &= ~flat_enough[:, None] | all_kinds
+        other.improve(every, rounds)
+        run.take(other)
     run.improve(np.ones(groups, np.int32), rounds)
     work = run.work.reshape(groups, KINDS, _WORK)
     normal = np.zeros((groups, KINDS, UNKNOWNS, UNKNOWNS))

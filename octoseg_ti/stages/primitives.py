@@ -8,7 +8,8 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, ti
 from octoseg_ti.device.surfaces import CONE, CYLINDER, KINDS, SPHERE, TORUS, surface_at
-from octoseg_ti.stages.fitting import FREE, iterate, moved
+from octoseg_ti.stages.fitting import iterate
+from octoseg_ti.stages.motions import FREE, moved
 from octoseg_ti.stages.starts import gather_moments, starts
 
 FREEDOM = FREE.sum(axis=1)
@@ -270,7 +271,7 @@ def fit_all(
             spread = np.repeat(spread.min(axis=1, keepdims=True), KINDS, axis=1)
         reach = TUKEY * np.maximum(spread, scale)
         state, normal = iterate(
-            *given, reach / extent[:, None], state, rounds=_ROUNDS, all_kinds=True
+            *given, reach / extent[:, None], state[None], rounds=_ROUNDS, all_kinds=True
         )
     parameters = to_parameters(state, m.centre, extent)
     sums = samples.sums(parameters, reach)

@@ -16,6 +16,8 @@ _COUNTED = 500  # points beyond these prove nothing more: then it is form, no no
 _FORM = 0.1  # deviations of form, in noise, that no kind has to explain
 _ROUNDING = 1e-5  # ... and in extents, for data without noise
 _ROOM = 3.0  # a kind may be so many times the noise away, in rms
+_NORMALS = 0.25  # what the normal of a point adds to its position: it was made of its neighbours
+_SMOOTH = 0.02  # deviations of normals [rad] that no kind has to explain
 _TILT = 2.0  # its normals may be so many times farther off than those of the best kind
 _TILT_ALWAYS = 0.1  # ... and this far [rad] at any rate
 _ONE_SIDED = 0.5  # least part of the size of the mean cosine that its sign must account for
@@ -51,9 +53,10 @@ def choose(
     """Choose the kind of every group.
 
     The scores of the kinds are n log(loss) plus a penalty for every unknown, so that each kind is
-    judged by the noise that it leaves, and the noise given only says what is too much. A larger
-    number of points does not make a plane with a trace of form into a huge cylinder: points count up
-    to a few hundred, and a tenth of the noise is taken for form.
+    judged by the noise that it leaves, and the noise given only says what is too much. More points
+    do not make a plane with a trace of form into a huge cylinder: points count up to a few hundred,
+    and a tenth of the noise is taken for form. Normals count too: a narrow ring of a cone lies on a
+    sphere, and faces elsewhere.
 
     Args:
         fits: The fits of all kinds.
@@ -71,6 +74,7 @@ def choose(
     possible = np.isfinite(fits.loss)
     loss = np.where(possible, fits.loss, np.inf)
     score = counted * np.log(loss + form**2) + _PENALTY * FREEDOM * np.log(np.maximum(counted, 2))
+    score += _NORMALS * counted * np.log(np.nan_to_num(fits.tilt, nan=1.0) ** 2 + _SMOOTH**2)
     fitting = possible & (fits.rms <= np.maximum(room * sigma, form)) & _agrees(fits, signed)
     score = np.where(fitting, score, np.inf)
     rows = np.arange(groups)

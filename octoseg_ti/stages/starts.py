@@ -15,13 +15,13 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import mat3, row, vec2, vec3
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, ti
 from octoseg_ti.device.surfaces import CONE, CYLINDER, KINDS, PLANE, SPHERE, TORUS
+from octoseg_ti.stages.motions import STATE
 
 _DIRECTIONS = 5  # tried as axis
 _FAR = 1e3  # no start is farther from the points than this, in units of their extent
+_LEAST = 1e-2  # the smallest ring to start from, in extents: at none, nothing would move it
+_OTHER = 0.87  # cosine below which a direction is quite another one
 _RIDGE = 1e-6  # of the mean square of the normals: keeps what they leave open near the points
-
-STATE = 11
-"""Numbers of a state: point (3), axis (3), a direction across it (3), shape (2)."""
 
 
 class Moments(NamedTuple):
@@ -237,6 +237,11 @@ def _limited(v: np.ndarray) -> np.ndarray:
     return v * np.minimum(1.0, _FAR / np.maximum(size, 1e-300))
 
 
+def _toward(v: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """Return directions of vectors; the other ones where a vector is too short to have any."""
+    return np.where(np.linalg.norm(v, axis=-1, keepdims=True) > 1e-6, _unit(v), otherwise)
+
+
 def across(axis: np.ndarray) -> np.ndarray:
     """Return a unit vector at right angles to each axis, shape (..., 3)."""
     other = np.where(np.abs(axis[..., :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
@@ -363,7 +368,10 @@ def _circles(
 def starts(
     points: np.ndarray, normals: np.ndarray, weight: np.ndarray, start: np.ndarray, m: Moments
 ) -> np.ndarray:
-    """Return a state of every group and kind to start from, shape (G, KINDS, STATE).
+    """Return two states of every group and kind to start from, shape (2, G, KINDS, STATE).
+
+    The second one has quite another axis, for cones and tori only: a saddle can be the inner side
+    of a torus about either of two axes, and noise hides which. NaN = none.
 
     Args:
         points: Positions [mm], shape (S, 3), f64.
@@ -377,28 +385,40 @@ def starts(
         of the group about its centre.
     """
     groups = len(start) - 1
-    state = np.zeros((groups, KINDS, STATE))
+    state = np.full((2, groups, KINDS, STATE), np.nan)
+    state[0] = 0.0
     axes = _axes(m)
     f = np.nan_to_num(_profile_means(points, normals, weight, start, m, axes))
     middle = np.linalg.norm(axes[..., :3], axis=-1)
     rows = np.arange(groups)
 
     def place(kind: int, square: np.ndarray, height: np.ndarray, *shape: np.ndarray) -> None:
-        best = np.argmin(np.nan_to_num(square, nan=np.inf), axis=1)
-        axis = axes[rows, best, 3:]
-        state[:, kind, :3] = axes[rows, best, :3] + height[rows, best, None] * axis
-        state[:, kind, 3:6] = axis
-        for k, values in enumerate(shape):
-            state[:, kind, 9 + k] = values[rows, best]
+        square = np.nan_to_num(square, nan=np.inf)
+        for which in range(2 if kind in (CONE, TORUS) else 1):
+            best = np.argmin(square, axis=1)
+            found = np.isfinite(square[rows, best]) | (which == 0)
+            axis = axes[rows, best, 3:]
+            chosen = np.zeros((groups, STATE))
+            chosen[:, :3] = axes[rows, best, :3] + height[rows, best, None] * axis
+            chosen[:, 3:6] = axis
+            for k, values in enumerate(shape):
+                chosen[:, 9 + k] = values[rows, best]
+            state[which, found, kind] = chosen[found]
+            alike = np.abs(np.einsum("gdi,gi->gd", axes[..., 3:], axis)) > _OTHER
+            square = np.where(alike, np.inf, square)
 
     zero = np.zeros(middle.shape)
     place(CYLINDER, f[..., 3] - f[..., 0] ** 2, zero, f[..., 0] + middle)
     angle, offset, square = _lines(f, middle)
     place(CONE, square, zero, angle, offset)
     ring, height, tube, square = _circles(f, middle)
-    place(TORUS, square, height, ring, tube)
-    state[:, SPHERE, :3], state[:, SPHERE, 9] = _spheres(m)
-    state[:, SPHERE, 5] = 1.0
-    state[:, PLANE, 3:6] = np.linalg.eigh(np.nan_to_num(m.qq))[1][:, :, 0]
-    state[:, :, 6:9] = across(state[:, :, 3:6])
+    place(TORUS, square, height, np.maximum(ring, _LEAST), tube)
+    state[0, :, SPHERE, :3], state[0, :, SPHERE, 9] = _spheres(m)
+    state[0, :, PLANE, 3:6] = np.linalg.eigh(np.nan_to_num(m.qq))[1][:, :, 0]
+    # Towards the points, which are about the origin.
+    toward = -state[..., :3]
+    state[0, :, SPHERE, 3:6] = _toward(toward[0, :, SPHERE], across(toward[0, :, SPHERE]))
+    axis = state[..., 3:6]
+    toward = toward - np.sum(toward * axis, axis=-1, keepdims=True) * axis
+    state[..., 6:9] = _toward(toward, across(axis))
     return state
