@@ -46,9 +46,9 @@ _SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS = 40, 8, 200
 _GAIN, _GROWTHS = 1.02, 4
 _LEFT = 0.005
 # Surfaces that a set was taken apart into are real when they explain so much of it, and leave no
-# more than this many noises: pieces of a free form are cut out as far as they just fit.
-_COVERED = 0.6
-_REAL = 1.1
+# more than this many noises, fewer the less they explain: pieces of a free form are cut out as far
+# as they just fit, and leave gaps.
+_COVERED, _REAL = 0.6, 1.15
 
 
 class Tolerance(NamedTuple):
@@ -366,13 +366,14 @@ def _real_ones(
     for members in sets:
         name, weight = label[members], samples.weight[members]
         on = name >= 0
-        if not on.any() or weight[on].sum() < _COVERED * weight.sum():
+        covered = weight[on].sum() / weight.sum()
+        if covered < _COVERED:
             continue
         far, _ = evaluate_surfaces(
             samples.point[members[on]], name[on], found.kind, found.parameters
         )
         rms = np.sqrt(np.average(far**2, weights=weight[on]))
-        real[name[on]] = rms <= _REAL * noise
+        real[name[on]] = rms <= _REAL * covered * noise
     kept = np.flatnonzero(real[:-1])
     number = np.full(len(real), NONE, np.int32)
     number[kept] = np.arange(len(kept), dtype=np.int32)

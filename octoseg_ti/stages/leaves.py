@@ -16,6 +16,7 @@ from octoseg_ti.stages.adjacency import Adjacency
 from octoseg_ti.stages.grid import Grid
 
 # Odd numbers with well mixed bits (the first digits of the roots of 2, 3 and 5, times 2^63).
+_FINE = 1024.0  # steps of the rounding in a smallest cell
 _MIX = (0x6A09E667F3BCC909, 0x5DB3D742C265539D, 0x1E3779B97F4A7C15)
 
 
@@ -66,11 +67,14 @@ class Samples:
 
 
 @ti.func
-def _hash(p: ti.template(), i: ti.i32) -> ti.i64:
-    """Return a number that looks random and depends on nothing but the coordinates."""
+def _hash(p: ti.template(), i: ti.i32, fine: ti.f64) -> ti.i64:
+    """Return a number that looks random and depends on nothing but the coordinates, finely rounded.
+
+    Rounded, because a part far from the origin has lost its last digits.
+    """
     h = ti.i64(0)
     for k in ti.static(range(3)):
-        h = (h ^ ti.bit_cast(p[i, k], ti.i64)) * ti.i64(_MIX[k])
+        h = (h ^ ti.cast(p[i, k] * fine, ti.i64)) * ti.i64(_MIX[k])
         h = h ^ (h >> 29)
     return h
 
@@ -78,6 +82,7 @@ def _hash(p: ti.template(), i: ti.i32) -> ti.i64:
 @ti.kernel
 def _pick(
     most: ti.i32,
+    fine: ti.f64,
     # In:
     point_in: F64Rows,
     taken_in: I32Array,
@@ -97,7 +102,7 @@ def _pick(
                 if taken_in[i] < 0:
                     if s == 0:
                         free += 1
-                    h = _hash(point_in, i)
+                    h = _hash(point_in, i, fine)
                     if h > last and h < best:
                         best = h
                         found = i
@@ -154,7 +159,8 @@ def sample_leaves(
     index = runtime.empty((len(leaves), most), np.int32)
     free = runtime.empty(len(leaves), np.int32)
     table = np.stack([leaves.first, leaves.count], axis=1)
-    _pick(most, grid.point, runtime.upload(taken), runtime.upload(table), index, free)
+    fine = _FINE * 2.0**grid.depth / grid.size
+    _pick(most, fine, grid.point, runtime.upload(taken), runtime.upload(table), index, free)
     picked, there = runtime.download(index), runtime.download(free)
     found = picked >= 0
     each = found.sum(axis=1)

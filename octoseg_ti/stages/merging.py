@@ -16,6 +16,7 @@ _FIT = 1.2
 _CAP = 4.0
 # A surface with fewer samples says nothing about another.
 _FEW = 10
+_UNIT = 1024.0
 
 
 def contacts(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -154,6 +155,7 @@ def explained_by_others(
     here = label >= 0
     mine, other = label[here], second[here]
     square = np.where(other >= 0, np.minimum(off[here], _CAP) ** 2, _CAP**2)
+    square = np.rint(_UNIT * square) / _UNIT  # whole units add up alike in any order
     size = np.bincount(mine, minlength=count)
     mean = np.bincount(mine, square, minlength=count) / np.maximum(size, 1)
     given_up = np.zeros(count, bool)

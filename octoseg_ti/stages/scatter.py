@@ -37,7 +37,10 @@ def surface_noise(grid: Grid) -> float:
         return 0.0
     ends = np.cumsum(count)
     index = np.arange(ends[-1]) + np.repeat(first - (ends - count), count)
-    point, normal = runtime.download(grid.point)[index], runtime.download(grid.normal)[index]
+    point = runtime.download(grid.point)[index]
+    # In an order that has nothing to do with that of the input.
+    order = np.lexsort((*point.T, np.repeat(np.arange(len(first)), count)))
+    point, normal = point[order], runtime.download(grid.normal)[index[order]]
     fit = fit_all(point, normal, None, np.concatenate([[0], ends]).astype(np.int32))
     spare = count[:, None] / (count[:, None] - FREEDOM[None, :])
     rms = np.where(np.isfinite(fit.rms), fit.rms * np.sqrt(spare), np.inf).min(axis=1)
