@@ -55,6 +55,8 @@ _REFIT = 300
 # A surface is given up when its neighbours explain its points with this mean square, in noises.
 _EXPLAINED = 2.0
 _MERGES = 3
+# A free form has at least this many times the points of the smallest patch.
+_FREE = 10.0
 # A point that fits nothing joins a patch within so many times the usual reach.
 _LOOSE = 3.0
 
@@ -80,6 +82,9 @@ class _Search:
         self.surfaces = no_surfaces()
         self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
         self.choice: Choice | None = None
+        # Leaves of free forms choose nothing; what fits nothing in a flat face is no group.
+        self.free = np.zeros(len(leaves), bool)
+        self.face = np.zeros(len(leaves), bool)
 
     @property
     def label(self) -> np.ndarray:
@@ -93,12 +98,20 @@ class _Search:
             self.surfaces.kind, self.surfaces.parameters, np.zeros(len(self.surfaces))
         )
         self.choice, self.own = label_points(
-            self.grid, self.leaves, self.own, table, self.rule, passes=passes
+            self.grid, self.leaves, self.own, table, self.rule, passes=passes, closed=self.free
         )
 
-    def add(self, samples: Samples, sets: list[np.ndarray]) -> bool:
+    def add(
+        self, samples: Samples, sets: list[np.ndarray], whole_only: np.ndarray | None = None
+    ) -> bool:
         """Explain sets of samples; say whether that gave any new surface."""
-        new, label = explain(samples, self.leaves, sets, self.tolerance)
+        new, label = explain(
+            samples, self.leaves, sets, self.tolerance, whole_only=whole_only
+        )
+        for members in sets:
+            large = samples.weight[members].sum() >= _FREE * self.tolerance.points
+            if large and not np.any(label[members] >= 0):
+                self.free[samples.leaf[members]] = True
         if len(new) == 0:
             return False
         base = len(self.surfaces)
@@ -140,7 +153,7 @@ class _Search:
         """Return samples of the points that fit nothing, in connected sets."""
         label, leaves = self.label, self.leaves
         left = np.add.reduceat((label < 0).astype(np.int32), leaves.first)
-        there = left >= _LEFT_POINTS
+        there = (left >= _LEFT_POINTS) & ~self.free & ~self.face
         both = there[leaves.a] & there[leaves.b]
         root = components(len(leaves), leaves.a[both], leaves.b[both])
         size = np.bincount(root[there], left[there], minlength=len(leaves))
@@ -171,7 +184,7 @@ class _Search:
         gone = explained_by_others(
             self.label,
             runtime.download(self.choice.second),
-            runtime.download(self.choice.off)[:, 1],
+            runtime.download(self.choice.off),
             len(self.surfaces),
             _EXPLAINED,
         )
@@ -184,7 +197,12 @@ class _Search:
 
 
 def find_surfaces(
-    grid: Grid, leaves: Leaves, group: np.ndarray, tolerance: Tolerance, rule: Rule
+    grid: Grid,
+    leaves: Leaves,
+    group: np.ndarray,
+    face: np.ndarray,
+    tolerance: Tolerance,
+    rule: Rule,
 ) -> Surfaced:
     """Find the analytic surfaces of a part, and the surface of every point.
 
@@ -192,10 +210,13 @@ def find_surfaces(
         grid: The sparse grid.
         leaves: Its leaves.
         group: Group of every leaf that the flood fill reached, -1 = none, shape (C,), i32.
+        face: Leaves of flat faces that were cut apart at bends, shape (C,), bool: each is one
+            surface or none.
         tolerance: What counts as lying on a surface.
         rule: What a point may differ from the surface that it takes.
     """
     search = _Search(grid, leaves, tolerance, rule)
+    search.face = face
     samples = search.samples
     part = group[samples.leaf]
     size = np.bincount(group[group >= 0], leaves.count[group >= 0], minlength=1)
@@ -204,8 +225,9 @@ def find_surfaces(
         for s in members_of(part, len(size))
         if len(s) and size[part[s[0]]] >= tolerance.points
     ]
+    flat = np.array([face[samples.leaf[s[0]]] for s in sets], bool)
     for turn in range(_ROUNDS):
-        if not search.add(samples, sets) and turn > 0:
+        if not search.add(samples, sets, flat if turn == 0 else None) and turn > 0:
             break
         search.choose(passes=2)
         search.refit()
@@ -236,7 +258,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
     turn = max(TURNS[0], TURNS[1] * tilt)
     rule = Rule(noise, tilt)
     surfaced = find_surfaces(
-        grid, graph, found.group[leaves], Tolerance(noise, turn, least), rule
+        grid, graph, found.group[leaves], found.face[leaves], Tolerance(noise, turn, least), rule
     )
     label, surface = number_pieces(graph, surfaced, least)
     # Regions of which surfaces explain less than half stay; they are free forms.

@@ -16,7 +16,7 @@ from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.surfaces import KINDS, evaluate_surfaces, surface_at
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.stages.leaves import Leaves, Samples
-from octoseg_ti.stages.primitives import fit_all
+from octoseg_ti.stages.primitives import Fits, fit_all
 from octoseg_ti.types import NONE, SurfaceKind
 
 # The simplest surface first.
@@ -201,18 +201,34 @@ def fit_sets(
     """
     if not sets:
         return np.zeros(0, np.int64), no_surfaces()
+    return _simplest_of(_fit(samples, sets, noise, robust=robust), noise)
+
+
+def _fit(
+    samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool = False
+) -> Fits:
+    """Fit all kinds of surfaces to every set of samples."""
     start = np.cumsum([0] + [len(s) for s in sets])
     index = np.concatenate(sets)
-    fits = fit_all(
+    return fit_all(
         samples.point[index], samples.normal[index], None, start, noise=noise, robust=robust
     )
+
+
+def _simplest_of(fits: Fits, noise: float) -> tuple[np.ndarray, Surfaces]:
+    """Return which fits give a surface, and the simplest of each."""
     kind = simplest(fits.rms, noise)
     fitted = np.flatnonzero(kind < KINDS)
     return fitted, Surfaces(kind=kind[fitted], parameters=fits.parameters[fitted, kind[fitted]])
 
 
 def explain(
-    samples: Samples, leaves: Leaves, sets: list[np.ndarray], tolerance: Tolerance
+    samples: Samples,
+    leaves: Leaves,
+    sets: list[np.ndarray],
+    tolerance: Tolerance,
+    *,
+    whole_only: np.ndarray | None = None,
 ) -> tuple[Surfaces, np.ndarray]:
     """Find the surfaces that explain sets of samples.
 
@@ -221,13 +237,17 @@ def explain(
         leaves: The leaves.
         sets: Samples that belong together, ascending, an array of indices for every set.
         tolerance: What counts as lying on a surface.
+        whole_only: Sets that are not taken apart, shape (len(sets),), bool; None = no set.
 
     Returns:
         The surfaces, and the one that every sample lies on, -1 = none, shape (A,), i32.
     """
     label = np.full(len(samples), NONE, np.int32)
     noise = tolerance.noise
-    fitted, whole = fit_sets(samples, [spread(s, _MANY) for s in sets], noise, robust=True)
+    if not sets:
+        return no_surfaces(), label
+    fits = _fit(samples, [spread(s, _MANY) for s in sets], noise, robust=True)
+    fitted, whole = _simplest_of(fits, noise)
     turn = max(tolerance.turn, 0.5)
     on = lie_on(samples, sets, fitted, whole, (_ON + 0.5) * noise, turn)
     kept = []
@@ -238,6 +258,8 @@ def explain(
             kept.append(m)
     done = np.zeros(len(sets), bool)
     done[fitted[kept]] = True
+    if whole_only is not None:
+        done |= whole_only
     rest = [s for s, d in zip(sets, done, strict=True) if not d]
     more, found = _take_apart(samples, leaves, rest, tolerance)
     label[found >= 0] = found[found >= 0] + len(kept)
@@ -355,11 +377,11 @@ def _take_apart(
             w.on[:, ~w.free[w.scored]] = 0.0
             if w.weight[w.free].sum() < max(_LEFT * w.weight.sum(), tolerance.points):
                 active.remove(s)
-    return _real_ones(samples, sets, found, label, noise)
+    return _real_ones(samples, sets, found, label, _REAL * noise)
 
 
 def _real_ones(
-    samples: Samples, sets: list[np.ndarray], found: Surfaces, label: np.ndarray, noise: float
+    samples: Samples, sets: list[np.ndarray], found: Surfaces, label: np.ndarray, limit: float
 ) -> tuple[Surfaces, np.ndarray]:
     """Drop the surfaces of sets that are free forms."""
     real = np.zeros(len(found) + 1, bool)
@@ -373,7 +395,7 @@ def _real_ones(
             samples.point[members[on]], name[on], found.kind, found.parameters
         )
         rms = np.sqrt(np.average(far**2, weights=weight[on]))
-        real[name[on]] = rms <= _REAL * covered * noise
+        real[name[on]] = rms <= covered * limit
     kept = np.flatnonzero(real[:-1])
     number = np.full(len(real), NONE, np.int32)
     number[kept] = np.arange(len(kept), dtype=np.int32)

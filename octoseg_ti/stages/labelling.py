@@ -42,7 +42,8 @@ class Choice(NamedTuple):
     second: Any
     """Surface that would come next, -1 = none near, shape (n,), i32 (kernel array)."""
     off: Any
-    """Distance of every point from these two [noises], shape (n, 2), f32 (kernel array)."""
+    """Distance of every point from its second [noises], and the angle between their normals
+    [tilts], shape (n, 2), f32 (kernel array)."""
 
 
 @ti.func
@@ -63,24 +64,27 @@ def _insert(list_inout: ti.template(), c: ti.i32, value: ti.i32):
 def _gather(
     # In:
     own_in: I32Rows,
+    closed_in: I32Array,
     start_in: I32Array,
     neighbor_in: I32Array,
     # Out:
     near_inout: I32Rows,
 ):
-    """Collect the surfaces of every leaf and of the leaves that touch it."""
+    """Collect the surfaces of every leaf and of the leaves that touch it; none where it is closed.
+    """
     for c in range(own_in.shape[0]):
         for k in range(MOST):
             near_inout[c, k] = -1
-        for k in range(MOST):
-            if own_in[c, k] >= 0:
-                _insert(near_inout, c, own_in[c, k])
-        for e in range(start_in[c], start_in[c + 1]):
-            b = neighbor_in[e]
-            k = 0
-            while k < MOST and own_in[b, k] >= 0:
-                _insert(near_inout, c, own_in[b, k])
-                k += 1
+        if closed_in[c] == 0:
+            for k in range(MOST):
+                if own_in[c, k] >= 0:
+                    _insert(near_inout, c, own_in[c, k])
+            for e in range(start_in[c], start_in[c + 1]):
+                b = neighbor_in[e]
+                k = 0
+                while k < MOST and own_in[b, k] >= 0:
+                    _insert(near_inout, c, own_in[b, k])
+                    k += 1
 
 
 @ti.kernel
@@ -109,8 +113,10 @@ def _choose(
             next_best = 1e30
             label_out[i] = -1
             second_out[i] = -1
-            off_out[i, 0] = ti.f32(1e30)
-            off_out[i, 1] = ti.f32(1e30)
+            for j in ti.static(range(2)):
+                off_out[i, j] = ti.f32(1e30)
+            best_off = 1e30
+            best_turn = 1e30
             k = 0
             while k < MOST and near_in[c, k] >= 0:
                 s = near_in[c, k]
@@ -131,14 +137,17 @@ def _choose(
                     if off <= rule[2] and cost < best:
                         next_best = best
                         second_out[i] = label_out[i]
-                        off_out[i, 1] = off_out[i, 0]
+                        off_out[i, 0] = ti.cast(best_off, ti.f32)
+                        off_out[i, 1] = ti.cast(best_turn, ti.f32)
                         best = cost
                         label_out[i] = s
-                        off_out[i, 0] = ti.cast(off, ti.f32)
+                        best_off = off
+                        best_turn = angle / rule[1]
                     elif cost < next_best:
                         next_best = cost
                         second_out[i] = s
-                        off_out[i, 1] = ti.cast(off, ti.f32)
+                        off_out[i, 0] = ti.cast(off, ti.f32)
+                        off_out[i, 1] = ti.cast(angle / rule[1], ti.f32)
                 k += 1
             if label_out[i] >= 0:
                 _insert(own_out, c, label_out[i])
@@ -217,6 +226,7 @@ def label_points(
     rule: Rule,
     *,
     passes: int = 1,
+    closed: np.ndarray | None = None,
 ) -> tuple[Choice, np.ndarray]:
     """Let every point choose its surface.
 
@@ -227,6 +237,7 @@ def label_points(
         surfaces: The surfaces (`surface_table`), shape (M, 10).
         rule: What a point may differ from its surface.
         passes: How many leaves beyond those in ``own`` a surface may reach.
+        closed: Leaves whose points choose nothing, shape (C,), bool; None = no leaf.
 
     Returns:
         The choice, and the surfaces that each leaf ended up with, as ``own``.
@@ -237,11 +248,14 @@ def label_points(
     off = runtime.empty((n, 2), np.float32)
     held = runtime.upload(own)
     near = runtime.empty(own.shape, np.int32)
+    shut = runtime.upload(
+        np.zeros(len(leaves), np.int32) if closed is None else closed.astype(np.int32)
+    )
     start, neighbor = runtime.upload(leaves.start), runtime.upload(leaves.neighbor)
     table = runtime.upload(np.stack([leaves.first, leaves.count], axis=1))
     device_surfaces = runtime.upload(surfaces)
     for _ in range(passes):
-        _gather(held, start, neighbor, near)
+        _gather(held, shut, start, neighbor, near)
         held = runtime.empty(own.shape, np.int32)
         _choose(
             tuple(rule), grid.point, grid.normal, table, near, device_surfaces,

@@ -17,6 +17,9 @@ _CAP = 4.0
 # A surface with fewer samples says nothing about another.
 _FEW = 10
 _UNIT = 1024.0
+# What deviates by no more than this many noises and tilts, and is no larger than this share of the
+# surface beside it, is an error of its form.
+_FORM, _SMOOTH, _SMALL = 4.0, 3.0, 0.15
 
 
 def contacts(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -141,10 +144,14 @@ def explained_by_others(
 ) -> np.ndarray:
     """Return which surfaces their neighbours explain nearly as well.
 
+    A surface goes when its points are within the noise of those that they would choose next. A
+    small one at the side of a large one also goes when it deviates as an error of form would: a
+    little, and smoothly.
+
     Args:
         label: Surface of every point, -1 = none, shape (n,), i32.
         second: The surface that each point would choose next, -1 = none, shape (n,), i32.
-        off: Distance from that surface [noises], shape (n,).
+        off: Distance from that surface [noises], and angle to its normal [tilts], shape (n, 2).
         count: Number of surfaces M.
         limit: Largest mean square of these distances.
 
@@ -153,25 +160,40 @@ def explained_by_others(
         leans on.
     """
     here = label >= 0
-    mine, other = label[here], second[here]
-    square = np.where(other >= 0, np.minimum(off[here], _CAP) ** 2, _CAP**2)
-    square = np.rint(_UNIT * square) / _UNIT  # whole units add up alike in any order
+    mine, other, near = label[here], second[here], off[here]
     size = np.bincount(mine, minlength=count)
-    mean = np.bincount(mine, square, minlength=count) / np.maximum(size, 1)
+    far = _mean_square(mine, np.where(other >= 0, near[:, 0], np.inf), _CAP, count)
+    deviation = _mean_square(mine, np.where(other >= 0, near[:, 0], np.inf), 2.0 * _FORM, count)
+    turn = _mean_square(mine, np.where(other >= 0, near[:, 1], np.inf), 2.0 * _SMOOTH, count)
     given_up = np.zeros(count, bool)
     leaned_on = np.zeros(count, bool)
     key = mine.astype(np.int64) * count + np.where(other >= 0, other, mine)
     pair, points = np.unique(key, return_counts=True)
     for m in np.argsort(size, kind="stable"):
-        if size[m] == 0 or mean[m] > limit or leaned_on[m]:
+        if size[m] == 0 or leaned_on[m]:
             continue
         lo, hi = np.searchsorted(pair, [m * count, (m + 1) * count])
-        heirs = (pair[lo:hi] % count)[points[lo:hi] * 5 >= size[m]]
-        if given_up[heirs].any():
+        heir = pair[lo:hi] % count
+        main = int(heir[np.argmax(points[lo:hi])])
+        form = (
+            main != m
+            and deviation[m] <= _FORM**2
+            and turn[m] <= _SMOOTH**2
+            and size[m] <= _SMALL * size[main]
+        )
+        heirs = heir[points[lo:hi] * 5 >= size[m]]
+        if (far[m] > limit and not form) or given_up[heirs].any():
             continue
         given_up[m] = True
         leaned_on[heirs] = True
     return given_up
+
+
+def _mean_square(owner: np.ndarray, value: np.ndarray, cap: float, count: int) -> np.ndarray:
+    """Return the mean square of the values of every owner, no value above the cap."""
+    square = np.minimum(value, cap) ** 2
+    square = np.rint(_UNIT * square) / _UNIT  # whole units add up alike in any order
+    return np.bincount(owner, square, count) / np.maximum(np.bincount(owner, minlength=count), 1)
 
 
 def pieces(leaves: Leaves, own: np.ndarray, count: int) -> np.ndarray:
