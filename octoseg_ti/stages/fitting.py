@@ -244,9 +244,9 @@ class _Run:
     """Fits under way: the work of every task, and which still move."""
 
     def __init__(
-        self, data: list[Any], state: np.ndarray, count: np.ndarray, robust: bool, all_kinds: bool
+        self, data: list[Any], state: np.ndarray, count: np.ndarray, robust: bool, leave: bool
     ) -> None:
-        self.robust, self.all_kinds = robust, all_kinds
+        self.robust, self.leave = robust, leave
         self.data, self.groups, self.count = data, len(count), count
         self.work = np.zeros((self.groups * KINDS, _WORK))
         self.work[:, :STATE] = state.reshape(-1, STATE)
@@ -285,7 +285,7 @@ class _Run:
             self.work = runtime.download(device)[: self.groups * KINDS]
             cost, gain = self.cost, self.work[:, _GAIN].reshape(self.groups, KINDS)
             rest = (gain * seen <= _REST) | (cost <= _EXACT * seen)
-            if k >= _PATIENCE and not self.all_kinds:
+            if k >= _PATIENCE and self.leave:
                 slow = gain < 0.1
                 worse = cost > _LEAVE * cost.min(axis=1, keepdims=True)
                 left = slow & (worse | (cost >= _contained(cost)))
@@ -305,7 +305,8 @@ def iterate(
     state: np.ndarray,
     *,
     rounds: int,
-    all_kinds: bool = False,
+    whole: bool = True,
+    leave: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit every kind to every group, from given states on.
 
@@ -322,7 +323,8 @@ def iterate(
         state: Where to start, shape (T, G, KINDS, STATE): the first try, and others for what may
             come to rest in a wrong place; NaN = none.
         rounds: Most passes over the points, of either sort.
-        all_kinds: Leave none; what a robust fit needs, as outliers can favour the wrong kind.
+        whole: Look at all the points in the end, not just at some.
+        leave: Leave kinds that fall behind; not for a robust fit, as outliers favour some kinds.
 
     Returns:
         The states; and the normal equations J'WJ there, shape (G, KINDS, UNKNOWNS, UNKNOWNS), zero
@@ -333,17 +335,18 @@ def iterate(
     flat = np.ascontiguousarray(reach.reshape(groups * KINDS))
     data = [runtime.upload(a) for a in (points, weight, start, frame, flat)]
     robust = bool(np.isfinite(flat).any())
-    run = _Run(data, state[0], count, robust, all_kinds)
+    run = _Run(data, state[0], count, robust, leave)
     every = np.maximum(count // _SOME, 1).astype(np.int32)
-    if np.any(every > 1) or len(state) > 1:
+    if np.any(every > 1) or len(state) > 1 or not whole:
         run.improve(every, rounds)
     for again in state[1:]:
-        other = _Run(data, again, count, robust, True)
+        other = _Run(data, again, count, robust, False)
         flat_enough = run.cost[:, PLANE] <= _LEAVE * run.cost.min(axis=1)
-        other.going &= ~flat_enough[:, None] | all_kinds
+        other.going &= ~(flat_enough[:, None] & leave)
         other.improve(every, rounds)
         run.take(other)
-    run.improve(np.ones(groups, np.int32), rounds)
+    if whole:
+        run.improve(np.ones(groups, np.int32), rounds)
     work = run.work.reshape(groups, KINDS, _WORK)
     normal = np.zeros((groups, KINDS, UNKNOWNS, UNKNOWNS))
     a, b = np.tril_indices(UNKNOWNS)

@@ -31,7 +31,7 @@ UNKNOWNS = 7
 """Shift along u and along the axis, turns about u, v = axis x u and the axis, relative change of
 the curvature at the anchor (its sign turned, so that the radius grows), and the tube radius of a
 torus. A cone with half angle h at the distance r from its axis has the curvature cos h / r and the
-taper sin h / r, and these two change, in units of 1 / r, while the line through the anchor stays."""
+taper sin h / r: these two change, in units of 1 / r, while the line through the anchor stays."""
 
 FREE = np.zeros((KINDS, UNKNOWNS), bool)
 """The unknowns that move a surface of every kind."""

@@ -263,15 +263,18 @@ def fit_all(
     given = samples.points, samples.weight, start, frame
     reach = np.full((groups, KINDS), np.inf)
     state = starts(points, normals, weight, start, m)
-    state, normal = iterate(*given, reach, state, rounds=_ROUNDS, all_kinds=robust)
+    state, normal = iterate(
+        *given, reach, state, rounds=_ROUNDS, whole=not robust, leave=not robust
+    )
     scale = np.broadcast_to(np.asarray(noise, np.float64), groups)[:, None]
     for narrowed in range(_NARROWED + 1 if robust else 0):
         spread = samples.spread(to_parameters(state, m.centre, extent), extent)
-        if narrowed == _NARROWED:
+        last = narrowed == _NARROWED
+        if last:
             spread = np.repeat(spread.min(axis=1, keepdims=True), KINDS, axis=1)
         reach = TUKEY * np.maximum(spread, scale)
         state, normal = iterate(
-            *given, reach / extent[:, None], state[None], rounds=_ROUNDS, all_kinds=True
+            *given, reach / extent[:, None], state[None], rounds=_ROUNDS, whole=last, leave=False
         )
     parameters = to_parameters(state, m.centre, extent)
     sums = samples.sums(parameters, reach)

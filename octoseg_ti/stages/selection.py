@@ -19,7 +19,8 @@ _ROOM = 3.0  # a kind may be so many times the noise away, in rms
 _NORMALS = 0.25  # what the normal of a point adds to its position: it was made of its neighbours
 _SMOOTH = 0.02  # deviations of normals [rad] that no kind has to explain
 _TILT = 2.0  # its normals may be so many times farther off than those of the best kind
-_TILT_ALWAYS = 0.1  # ... and this far [rad] at any rate
+_TILT_ALWAYS = 0.2  # ... and this far [rad] at any rate
+_RIVAL = 4.0  # times the least loss: kinds that fit about as well
 _ONE_SIDED = 0.5  # least part of the size of the mean cosine that its sign must account for
 
 
@@ -75,7 +76,7 @@ def choose(
     loss = np.where(possible, fits.loss, np.inf)
     score = counted * np.log(loss + form**2) + _PENALTY * FREEDOM * np.log(np.maximum(counted, 2))
     score += _NORMALS * counted * np.log(np.nan_to_num(fits.tilt, nan=1.0) ** 2 + _SMOOTH**2)
-    fitting = possible & (fits.rms <= np.maximum(room * sigma, form)) & _agrees(fits, signed)
+    fitting = possible & (fits.rms <= np.maximum(room * sigma, form)) & _agrees(fits, loss, signed)
     score = np.where(fitting, score, np.inf)
     rows = np.arange(groups)
     best = np.argmin(score, axis=1)
@@ -99,10 +100,15 @@ def choose(
     )
 
 
-def _agrees(fits: Fits, signed: bool) -> np.ndarray:
-    """Say where the measured normals are those of the surface, shape (G, 5)."""
+def _agrees(fits: Fits, loss: np.ndarray, signed: bool) -> np.ndarray:
+    """Say where the measured normals are those of the surface, shape (G, 5).
+
+    The best normals are looked for among the kinds that fit the points about as well as any.
+    """
     tilt = np.where(np.isfinite(fits.tilt), fits.tilt, np.inf)
-    near = tilt <= np.maximum(_TILT * tilt.min(axis=1, keepdims=True), _TILT_ALWAYS)
+    rivals = loss <= _RIVAL * loss.min(axis=1, keepdims=True)
+    least = np.where(rivals, tilt, np.inf).min(axis=1, keepdims=True)
+    near = tilt <= np.maximum(_TILT * least, _TILT_ALWAYS)
     if not signed:
         return near
     cosine = np.sqrt(np.maximum(1.0 - tilt**2, 0.0))
