@@ -20,7 +20,7 @@ from octoseg_ti.stages.filtering import filter_normals, independent_lag, square_
 from octoseg_ti.stages.grid import Grid, build_grid
 from octoseg_ti.stages.measure import stripe_noise, stripe_spacing
 from octoseg_ti.stages.moments import LEVEL, STOP
-from octoseg_ti.stages.neighbors import neighbor_normals
+from octoseg_ti.stages.neighbors import PASSES, neighbor_normals
 from octoseg_ti.stages.normals import edge_pair_normals
 from octoseg_ti.stages.refinement import refine_poses
 from octoseg_ti.stages.registration import to_world
@@ -149,12 +149,14 @@ def estimate_normals(
         else:
             low, high = arranged.points.min(axis=0), arranged.points.max(axis=0)
             outward = arranged.points - (low + high) / 2.0
-        estimated, measured = neighbor_normals(arranged.points, outward, params.normals.neighbors)
-        return (
-            (estimated if arranged.normals is None else arranged.normals),
-            measured,
-            _unfiltered(params),
+        passes = PASSES if params.normals.smooth is None else params.normals.smooth
+        if arranged.normals is not None:
+            passes = 0
+        estimated, measured = neighbor_normals(
+            arranged.points, outward, params.normals.neighbors, passes=passes
         )
+        params = replace(params, normals=replace(params.normals, smooth=passes))
+        return (estimated if arranged.normals is None else arranged.normals), measured, params
     if arranged.normals is not None:
         return arranged.normals, measured, _unfiltered(params)
     origin = scans.origin
