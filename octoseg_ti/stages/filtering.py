@@ -284,9 +284,10 @@ def independent_lag(passes: int, lag: int = 1) -> int:
     """
     if passes == 0:
         return 3
-    # Every mean spreads an error by 0.8 neighbours, edge pairs by 0.7; errors farther apart than
-    # three times the root of the sum of squares share next to nothing.
-    return lag * math.ceil(3.0 * math.sqrt(0.6 * (passes + 1) + 0.5))
+    # Every mean spreads an error by 0.8 neighbours, edge pairs by 0.7. Two and a half times the
+    # root of the sum of squares apart they share next to nothing. (Farther is no better: there may
+    # be another face.)
+    return lag * math.ceil(2.5 * math.sqrt(0.6 * (passes + 1) + 0.5))
 
 
 def filter_normals(
