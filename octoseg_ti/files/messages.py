@@ -62,8 +62,9 @@ PARAMS_FIELDS = (
     ("registration_refine", "bool"),
     ("registration_reach", "double"),
     ("registration_overlap", "double"),
+    ("normals_smooth", "double"),
 )
-"""octoseg.Params: "section_option" of `Params`, mm and rad; NaN = derived from the data."""
+"""octoseg.Params: "section_option" of `Params`, mm and rad; NaN or "" = derived from the data."""
 
 METRICS_FIELDS = (
     ("points", "double"),
@@ -131,6 +132,8 @@ def flat_params(values: Mapping[str, Mapping[str, Any]], preset: str = "") -> An
         value = values[section][option]
         if kind == "double":
             value = float("nan") if value is None else float(value)
+        elif kind == "string" and value is None:
+            value = ""
         setattr(message, name, value)
     return message
 
