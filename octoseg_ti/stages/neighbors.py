@@ -196,9 +196,10 @@ def neighbor_normals(
         # freedom.
         kept = off[: max(1, 3 * len(off) // 4)]
         noise = float(np.sqrt(np.mean(kept**2, dtype=np.float64) * count / max(1, count - 3)))
-    # Slope of a plane fitted in a disc of radius r: sigma / (r / 2) / sqrt(count), in two
-    # directions.
-    tilt = 2.0 * np.sqrt(2.0 / count) * noise / float(np.median(radius))
+    # Slope of a plane through n points spread evenly in a disc of radius r: 2 sigma / r / sqrt(n)
+    # in each of two directions; n - 3 because few points may happen to lie nearly on a line. The
+    # point that bounds the neighbourhood is not in it.
+    tilt = 2.0 * np.sqrt(2.0 / max(1, count - 4)) * noise / float(np.median(radius))
     equal = max(_EQUAL_NOISES * noise, _EQUAL_SPACINGS * spacing) ** 2
     for _ in range(passes if spacing > 0 else 0):
         new = runtime.empty((n, 3), np.float64), runtime.empty(n, np.float32)

@@ -47,9 +47,9 @@ def neighbor_normals(
     rms = math.sqrt(math.fsum(h * h for h in heights) / len(heights))
     count = k + 1
     noise = rms * math.sqrt(count / max(1, count - 3))  # a plane takes three degrees of freedom
-    # The slope of a plane over a disc of radius r with its points spread evenly has the deviation
-    # 2 noise / (r sqrt(count)) in each of two directions.
-    tilt = 2.0 * math.sqrt(2.0 / count) * noise / float(np.median(radii))
+    # The slope of a plane over a disc of radius r with its n points spread evenly has the deviation
+    # 2 noise / (r sqrt(n)) in each of two directions, more where n is small.
+    tilt = 2.0 * math.sqrt(2.0 / max(1, count - 4)) * noise / float(np.median(radii))
     spacing = float(np.median(nearest)) if nearest else 0.0
     equal = max(0.5 * noise, 0.001 * spacing) ** 2
     for _ in range(passes):
