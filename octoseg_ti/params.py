@@ -39,7 +39,7 @@ class NormalParams:
     where noisy normals are filtered, for there the errors of heights cancel out; else unit."""
     smooth: int | None = None
     """Passes of the filter that smooths normals within faces and keeps edges; 0 = off. Default:
-    from their noise, 0 where it is below the least tolerance."""
+    from their noise, 0 where it is below the least tolerance; 3 when the input has no stripes."""
     neighbors: int = 12
     """Neighbours of a point when the input has no stripes (I8)."""
 

@@ -20,7 +20,7 @@ from octoseg_ti.stages.filtering import filter_normals, independent_lag, square_
 from octoseg_ti.stages.grid import Grid, build_grid
 from octoseg_ti.stages.measure import stripe_noise, stripe_spacing
 from octoseg_ti.stages.moments import LEVEL, STOP
-from octoseg_ti.stages.neighbors import neighbor_normals
+from octoseg_ti.stages.neighbors import PASSES, neighbor_normals
 from octoseg_ti.stages.normals import edge_pair_normals
 from octoseg_ti.stages.refinement import refine_poses
 from octoseg_ti.stages.registration import to_world
@@ -148,57 +148,72 @@ def estimate_normals(
 ) -> tuple[np.ndarray, Measurement, Params]:
     """Return the normals of the arranged points, in the frame of the scans; filtered where noisy.
 
-    With them come the measurement and the parameters, with what was found on the way.
+    With them come the measurement, with the noise before the filter, and the parameters.
     """
     if arranged.run is None or arranged.start is None:
-        if scans.origin is not None:
-            outward = scans.origin[arranged.view] - arranged.points
-        else:
-            low, high = arranged.points.min(axis=0), arranged.points.max(axis=0)
-            outward = arranged.points - (low + high) / 2.0
-        estimated, measured = neighbor_normals(arranged.points, outward, params.normals.neighbors)
-        return (
-            (estimated if arranged.normals is None else arranged.normals),
-            measured,
-            _unfiltered(params),
-        )
+        return _without_stripes(scans, arranged, params)
     if arranged.normals is not None:
-        return arranged.normals, measured, _unfiltered(params)
+        return arranged.normals, measured, _with_passes(params, 0)
     origin = scans.origin
     if origin is not None and scans.frame == "view" and scans.T_world_view is not None:
         to_view = np.linalg.inv(scans.T_world_view[: len(origin)])
         origin = np.einsum("vij,vj->vi", to_view[:, :3, :3], origin) + to_view[:, :3, 3]
-    points, start, view, chosen = arranged.points, arranged.start, arranged.view, params.normals
+    points, start, run, view = arranged.points, arranged.start, arranged.run, arranged.view
+    chosen = params.normals
     assert chosen.gap is not None
     how: dict[str, Any] = {"gap": chosen.gap, "rule": chosen.rule, "origin": origin}
-    normal = edge_pair_normals(points, start, view, weight=chosen.weight or "unit", **how)
+    weight = chosen.weight or "unit"
+    normal = edge_pair_normals(points, start, view, weight=weight, **how)
     if chosen.smooth == 0:
-        return normal, measured, _unfiltered(params)
-    noise, tilt = stripe_noise(points, normal, start, arranged.run, chosen.gap)
-    noisy = replace(measured, noise=noise, normal_noise=tilt)
-    params = replace(params, normals=derive(params, noisy).normals)
-    assert params.normals.smooth is not None and params.normals.weight is not None
-    if params.normals.smooth > 0:
-        if params.normals.weight != (chosen.weight or "unit"):
-            normal = edge_pair_normals(points, start, view, weight=params.normals.weight, **how)
+        return normal, measured, _with_passes(params, 0)
+    noise, tilt = stripe_noise(points, normal, start, run, chosen.gap)
+    measured = replace(measured, noise=noise, normal_noise=tilt)
+    chosen = derive(params, measured).normals
+    assert chosen.gap is not None and chosen.smooth is not None and chosen.weight is not None
+    if chosen.smooth > 0:
+        if chosen.weight != weight:
+            normal = edge_pair_normals(points, start, view, weight=chosen.weight, **how)
+        lag = square_lag(measured.spacing_along, measured.spacing_across)
         normal = filter_normals(
             points,
             normal,
             start,
-            arranged.run,
+            run,
             view,
-            passes=params.normals.smooth,
+            passes=chosen.smooth,
             gap=chosen.gap,
             noise=tilt,
-            lag=square_lag(measured.spacing_along, measured.spacing_across),
+            lag=lag,
         )
-    return normal, measured, params
+    return normal, measured, replace(params, normals=chosen)
 
 
-def _unfiltered(params: Params) -> Params:
-    """Return the parameters for normals that are not filtered."""
+def _without_stripes(
+    scans: Scans, arranged: Arranged, params: Params
+) -> tuple[np.ndarray, Measurement, Params]:
+    """Return the normals of unorganised points, the measurement and the parameters."""
+    if scans.origin is not None:
+        outward = scans.origin[arranged.view] - arranged.points
+    else:
+        low, high = arranged.points.min(axis=0), arranged.points.max(axis=0)
+        outward = arranged.points - (low + high) / 2.0
+    passes = PASSES if params.normals.smooth is None else params.normals.smooth
+    if arranged.normals is not None:
+        passes = 0
+    normal, measured = neighbor_normals(
+        arranged.points, outward, params.normals.neighbors, passes=passes
+    )
+    return (
+        normal if arranged.normals is None else arranged.normals,
+        measured,
+        _with_passes(params, passes),
+    )
+
+
+def _with_passes(params: Params, passes: int) -> Params:
+    """Return the parameters with what their noise does not tell."""
     weight = params.normals.weight or "unit"
-    return replace(params, normals=replace(params.normals, smooth=0, weight=weight))
+    return replace(params, normals=replace(params.normals, smooth=passes, weight=weight))
 
 
 def register(
@@ -256,6 +271,9 @@ def measure_noise(
     noise, tilt = stripe_noise(
         point, normal, arranged.start, arranged.run, params.normals.gap, lag=lag
     )
+    if params.normals.smooth:
+        # Normals that far apart differ by the shape of small faces too; no filter adds noise.
+        tilt = min(tilt, measured.normal_noise)
     return replace(measured, noise=noise, normal_noise=tilt)
 
 

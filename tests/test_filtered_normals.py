@@ -9,6 +9,7 @@ from conftest import make_tent
 from octoseg_ti import Params, Scans, Truth, paper, segment
 from octoseg_ti.defaults import LEAST_TOLERANCE, NOISE_FLOORS, SMOOTH_PASSES, passes_for
 from octoseg_ti.params import NormalParams
+from octoseg_ti.stages.neighbors import PASSES
 
 OFF = Params(normals=NormalParams(smooth=0))
 
@@ -66,6 +67,15 @@ def test_given_normals_stay_as_given(tents) -> None:
     answer = segment(replace(scans, normals=noisy))
     np.testing.assert_array_equal(answer.normals, noisy.astype(np.float32))
     assert answer.params.normals.smooth == 0
+
+
+def test_without_stripes_creases_are_sharpened_unless_switched_off(tents) -> None:
+    points = tents[0.0][0].points
+    for params, smooth in ((Params(), PASSES), (OFF, 0), (paper(), 0)):
+        assert segment(points, params).params.normals.smooth == smooth
+    given = segment(points, normals=np.tile([0.0, 0.0, 1.0], (len(points), 1)))
+    assert given.params.normals.smooth == 0
+    assert np.all(given.normals == [0, 0, 1])
 
 
 def test_more_noise_takes_more_passes() -> None:

@@ -67,8 +67,7 @@ PARAMS_FIELDS = (
     ("surfaces_noise", "double"),
     ("surfaces_tilt", "double"),
 )
-"""octoseg.Params: "section_option" of `Params`, mm and rad; NaN, or an empty text = derived from the
-data."""
+"""octoseg.Params: "section_option" of `Params`, mm and rad; NaN or "" = derived from the data."""
 
 METRICS_FIELDS = (
     ("points", "double"),

@@ -33,6 +33,7 @@ _OPENING = 2
 # Spread that is nothing: in means of what noise leaves, plus so many times that of a curved face.
 _SPREAD_NOISES = 4.0
 _SPREAD_CURVED = 4.0
+_SAMPLES = 6000
 _NONE = -1
 
 _vec3_f32 = ti.types.vector(3, ti.f32)
@@ -264,7 +265,7 @@ def _finish(
 
 
 def square_lag(along: float, across: float) -> int:
-    """Return how many points of a stripe span about the distance to the next stripe, 1, 2, 4 ...
+    """Return how many points of a stripe reach as far as the next stripe at most: 1, 2, 4 ...
 
     Args:
         along: Spacing along the stripes [mm].
@@ -272,7 +273,7 @@ def square_lag(along: float, across: float) -> int:
     """
     if along <= 0.0 or across <= along:
         return 1
-    return int(2 ** round(math.log2(across / along)))
+    return int(2 ** math.floor(math.log2(across / along)))
 
 
 def independent_lag(passes: int, lag: int = 1) -> int:
@@ -284,9 +285,10 @@ def independent_lag(passes: int, lag: int = 1) -> int:
     """
     if passes == 0:
         return 3
-    # Every mean spreads an error by 0.8 neighbours, edge pairs by 0.7; errors farther apart than
-    # three times the root of the sum of squares share next to nothing.
-    return lag * math.ceil(3.0 * math.sqrt(0.6 * (passes + 1) + 0.5))
+    # Every mean spreads an error by 0.8 neighbours, edge pairs by 0.7. Two and a half times the
+    # root of the sum of squares apart they share next to nothing. (Farther is no better: there may
+    # be another face.)
+    return lag * math.ceil(2.5 * math.sqrt(0.6 * (passes + 1) + 0.5))
 
 
 def filter_normals(
@@ -337,7 +339,7 @@ def filter_normals(
             break
         step *= 2
     spread, curved, scratch, weight = (runtime.empty(n, np.float32) for _ in range(4))
-    sample = sample_stripes(start)
+    sample = sample_stripes(start, _SAMPLES)
     for again in range(passes):
         _measure_spread(ring, old, spread)
         if again == 0:

@@ -11,16 +11,17 @@ _SAMPLES = 25_000
 _TRIM = 0.75
 
 
-def sample_stripes(start: np.ndarray) -> np.ndarray:
-    """Return about 25,000 points, evenly along every stripe from its first one.
+def sample_stripes(start: np.ndarray, count: int = _SAMPLES) -> np.ndarray:
+    """Return about so many points, evenly along every stripe from its first one.
 
     Args:
         start: First point of every stripe, and N at the end, shape (S + 1,), i32.
+        count: How many points at least, where there are as many.
 
     Returns:
         Indices of points, ascending, i32.
     """
-    step = max(1, int(start[-1]) // _SAMPLES)
+    step = max(1, int(start[-1]) // count)
     counts = -(-np.diff(start) // step)
     ends = np.cumsum(counts)
     within = np.arange(ends[-1], dtype=np.int32) - np.repeat(
