@@ -16,7 +16,7 @@ from octoseg_ti.patches import assemble, grow_regions
 from octoseg_ti.stages.cleaning import mark_outliers
 from octoseg_ti.stages.edges import edges_by_level, edges_by_radius, edges_by_reason
 from octoseg_ti.stages.grid import Grid, build_grid
-from octoseg_ti.stages.measure import stripe_noise, stripe_spacing
+from octoseg_ti.stages.measure import stripe_noise, stripe_roughness, stripe_spacing
 from octoseg_ti.stages.moments import LEVEL, STOP
 from octoseg_ti.stages.neighbors import neighbor_normals
 from octoseg_ti.stages.normals import edge_pair_normals
@@ -110,22 +110,30 @@ def clean(scans: Scans, params: Params) -> tuple[Arranged, Measurement, Params]:
             params,
         )
     along, across = stripe_spacing(arranged.points, arranged.start, arranged.run, arranged.view)
+    rough = stripe_roughness(arranged.points, arranged.start, arranged.run)
     measured = Measurement(
-        spacing_along=along or across, spacing_across=across or along, noise=0.0, normal_noise=0.0
+        spacing_along=along or across, spacing_across=across or along, noise=rough, normal_noise=0.0
     )
     params = replace(
         params,
         cleaning=derive(params, measured).cleaning,
         normals=derive(params, measured).normals,
     )
-    assert params.cleaning.spike is not None and params.cleaning.isolation is not None
-    if params.cleaning.enabled:
+    chosen = params.cleaning
+    assert chosen.spike is not None and chosen.isolation is not None
+    assert chosen.detached is not None
+    if chosen.enabled:
         marked = mark_outliers(
             arranged.points,
             arranged.start,
             arranged.run,
-            spike=params.cleaning.spike,
-            isolation=params.cleaning.isolation,
+            arranged.view,
+            scans.T_world_view if scans.frame == "view" else None,
+            spike=chosen.spike,
+            isolation=chosen.isolation,
+            detached=chosen.detached,
+            along=measured.spacing_along,
+            across=measured.spacing_across,
         )
         if marked.any():
             arranged = without(arranged, marked > 0, len(scans))
