@@ -207,7 +207,11 @@ def _weigh(
             n, x, y, xx, xy, yy = n + 1.0, x + u, y + v, xx + u * u, xy + u * v, yy + v * v
     # Without p: a point off a surface makes a plane with any line of it.
     x, y = x / ti.max(n, 1.0), y / ti.max(n, 1.0)
-    xx, xy, yy = xx / ti.max(n, 1.0) - x * x, xy / ti.max(n, 1.0) - x * y, yy / ti.max(n, 1.0) - y * y
+    xx, xy, yy = (
+        xx / ti.max(n, 1.0) - x * x,
+        xy / ti.max(n, 1.0) - x * y,
+        yy / ti.max(n, 1.0) - y * y,
+    )
     least = 0.5 * (xx + yy) - ti.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
     return vec3(weight, n, least)
 

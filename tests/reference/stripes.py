@@ -48,11 +48,9 @@ def doubtful(
 
 def stripe_roughness(points: np.ndarray, start: np.ndarray) -> float:
     """Return the noise from the distances to the line through the two neighbours [mm]."""
-    off = [
-        to_line(points[i], points[i - 1], points[i + 1]) for s in runs(start) for i in s[1:-1]
-    ]
-    normal, q = NormalDist(), NormalDist().inv_cdf(0.875)
-    return lower_three_quarters(off) / (2 * (normal.pdf(0) - normal.pdf(q)) / 0.75) / math.sqrt(1.5)
+    off = [to_line(points[i], points[i - 1], points[i + 1]) for s in runs(start) for i in s[1:-1]]
+    upper = sorted(off)[int(0.75 * (len(off) - 1))] if off else 0.0
+    return upper / NormalDist().inv_cdf(0.875) / math.sqrt(1.5)
 
 
 def stripe_spacing(points: np.ndarray, start: np.ndarray, view: np.ndarray) -> tuple[float, float]:
