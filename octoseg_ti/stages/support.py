@@ -53,10 +53,9 @@ def _carried(point: ti.template(), view: ti.template(), pose: ti.template(), i: 
 @ti.func
 def _cube(p: vec3, size: ti.f64) -> ivec3:
     """Return the cube that holds a place; what is too far for a number of 32 bits shares some."""
-    c = ivec3(0, 0, 0)
-    for k in ti.static(range(3)):
-        c[k] = ti.cast(ti.floor(ti.max(-_FAR, ti.min(_FAR, p[k] * (1.0 / size)))), ti.i32)
-    return c
+    scale = 1.0 / size
+    inside = ti.max(-_FAR, ti.min(_FAR, p * scale))
+    return ti.cast(ti.floor(inside), ti.i32)
 
 
 @ti.func

@@ -47,6 +47,10 @@ def test_equals_the_reference(seed: int, views: int) -> None:
     assert got.any() and not got.all()
 
 
+def up(points: np.ndarray, height: float) -> np.ndarray:
+    return points + np.array([0.0, 0.0, height])
+
+
 def lattice(rows: int, columns: int, z: float = 0.0, at: float = 0.0) -> np.ndarray:
     y, x = np.meshgrid(np.arange(columns) * 0.8 + at, np.arange(rows) * 1.0 + at)
     return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z)])
@@ -77,7 +81,7 @@ def test_a_small_group_is_an_outlier_and_a_large_one_is_not() -> None:
 def test_another_view_holds_a_small_group() -> None:
     small, same = lattice(4, 5, 5.0), lattice(9, 9, 5.02, at=-1.3)
     assert held([lattice(9, 9), small, same], [0, 0, 1], 1).all()
-    assert not held([lattice(9, 9), small, same + [0, 0, 0.6]], [0, 0, 1], 1).any()
+    assert not held([lattice(9, 9), small, up(same, 0.6)], [0, 0, 1], 1).any()
 
 
 def test_a_line_of_points_is_no_surface() -> None:
@@ -93,8 +97,8 @@ def test_the_corner_of_a_box_is_held(height: float) -> None:
     """Three faces meet; a point of each, right at the corner."""
     top, side = lattice(8, 10), lattice(8, 10)[:, [0, 2, 1]] * [1, 1, -1]
     end = lattice(8, 10)[:, [2, 0, 1]] * [1, 1, -1]
-    box = np.concatenate([top, side, end]) + [0, 0, height]
-    corner = np.array([[0.1, 0.1, 0.0], [0.1, 0.0, -0.1], [0.0, 0.1, -0.1]]) + [0, 0, height]
+    box = up(np.concatenate([top, side, end]), height)
+    corner = up(np.array([[0.1, 0.1, 0.0], [0.1, 0.0, -0.1], [0.0, 0.1, -0.1]]), height)
     assert held([box, corner], [0, 0], 1).all()
 
 
@@ -105,4 +109,4 @@ def test_far_places_and_shared_buckets() -> None:
     assert held([plane + 1e6, point + 1e6], [0, 0], 1).tolist() == [True, False]
     wide = lattice(60, 60) * [40.0, 40.0, 1.0]
     assert held([plane, point, wide], [0, 0, 0], 1).tolist() == [True, False]
-    assert held([plane, point + [0, 0, 1e300]], [0, 0], 1).tolist() == [False, False]
+    assert held([plane, up(point, 1e300)], [0, 0], 1).tolist() == [False, False]
