@@ -10,6 +10,8 @@ cubes, by the number of the bucket and then of the point, so that any number of 
 same neighbours in the same order.
 """
 
+from typing import Any
+
 import numpy as np
 
 from octoseg_ti.device import runtime
@@ -34,8 +36,8 @@ _FAR = 1e9
 _BUCKETS = 64  # a doubtful point
 _BITS = (12, 20)  # of the number of a bucket, from .. to
 
-ivec2 = ti.types.vector(2, ti.i32)
-ivec3 = ti.types.vector(3, ti.i32)
+ivec2: Any = ti.types.vector(2, ti.i32)
+ivec3: Any = ti.types.vector(3, ti.i32)
 vec6 = ti.types.vector(6, ti.f64)
 
 
