@@ -361,14 +361,13 @@ def _join(
 
 @ti.kernel
 def _name_groups(
-    # In:
-    parent_in: I32Array,
     # Out:
+    parent_inout: I32Array,
     root_out: I32Array,
 ):
     """Write the smallest member of every group."""
-    for s in parent_in:
-        root_out[s] = find(parent_in, s)
+    for s in root_out:
+        root_out[s] = find(parent_inout, s)
 
 
 def find_support(
