@@ -21,13 +21,13 @@ GAP_SPACINGS = 3.0
 """A strip of triangles breaks where an edge is longer than this many spacings."""
 REACH_SPACINGS = 3.0
 """A point finds its partner in another view within this many spacings."""
-SPIKE_SPACINGS = 2.0
-"""A spike stands off from its neighbours by this many spacings: the corner point of a sharp edge
-stands off by 0.7 at most."""
-SPIKE_NOISES = 6.0
+SPIKE_SPACINGS = 0.1
+"""A spike stands off from the surfaces around it by this many spacings: a sphere of 13 spacings
+radius falls away by as much at 1.6 spacings."""
+SPIKE_NOISES = 4.0
 """... and by this many standard deviations of the noise."""
-ISOLATION_SPACINGS = 5.0
-"""A point is isolated when its neighbours on the stripe are farther than this many spacings."""
+ISOLATION_SPACINGS = 2.5
+"""Neighbours farther than this many spacings do not hold a point."""
 PATCH_CELLS = 16.0
 """A patch covers at least the area of this many smallest cells: a square of four by four."""
 SMOOTH_PASSES = (2, 6)
@@ -80,6 +80,12 @@ def derive(params: Params, measured: Measurement) -> Params:
         cleaning = replace(cleaning, spike=stand_off)
     if cleaning.isolation is None:
         cleaning = replace(cleaning, isolation=ISOLATION_SPACINGS * spacing)
+    # What nothing holds and is too small for a patch is no loss.
+    area = PATCH_CELLS * (CELL_SPACINGS * spacing) ** 2
+    one = measured.spacing_along * measured.spacing_across
+    smallest = max(3, round(area / one)) if one > 0 else 3
+    if cleaning.detached is None:
+        cleaning = replace(cleaning, detached=smallest)
     if normals.gap is None:
         normals = replace(normals, gap=GAP_SPACINGS * spacing)
     if normals.smooth is None:
@@ -102,9 +108,7 @@ def derive(params: Params, measured: Measurement) -> Params:
         angle = min(most, max(least, times * grid.edge_tolerance))
         regions = replace(regions, homogeneity=angle)
     if regions.min_points is None:
-        area = PATCH_CELLS * (CELL_SPACINGS * spacing) ** 2
-        one = measured.spacing_along * measured.spacing_across
-        regions = replace(regions, min_points=max(3, round(area / one)) if one > 0 else 3)
+        regions = replace(regions, min_points=smallest)
     surfaces = params.surfaces
     if surfaces.noise is None:
         times, share = SURFACE_NOISE

@@ -15,15 +15,18 @@ from typing import Any, Literal
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CleaningParams:
-    """Marking of spikes and isolated points (I3)."""
+    """Marking of spikes, isolated points and detached groups (I3)."""
 
     enabled: bool = True
-    """Mark spikes and isolated points before normals are estimated."""
+    """Mark spikes, isolated points and small detached groups before normals are estimated."""
     spike: float | None = None
-    """Smallest distance of a spike from the line through its neighbours [mm]; default: from noise
-    and spacing."""
+    """Smallest distance of a spike from the surfaces around it [mm]; default: from noise and
+    spacing."""
     isolation: float | None = None
-    """Largest gap that a point may have to all its neighbours [mm]; default: from the spacing."""
+    """Neighbours that are farther than this do not hold a point [mm]; default: from the spacing."""
+    detached: int | None = None
+    """A group of fewer points is an outlier where no other points and no other view hold it; 0 =
+    keep every group. Default: from the spacing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

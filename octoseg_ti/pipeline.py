@@ -18,7 +18,7 @@ from octoseg_ti.stages.cleaning import mark_outliers
 from octoseg_ti.stages.edges import edges_by_level, edges_by_radius, edges_by_reason
 from octoseg_ti.stages.filtering import filter_normals, independent_lag, square_lag
 from octoseg_ti.stages.grid import Grid, build_grid
-from octoseg_ti.stages.measure import stripe_noise, stripe_spacing
+from octoseg_ti.stages.measure import stripe_noise, stripe_roughness, stripe_spacing
 from octoseg_ti.stages.moments import LEVEL, STOP
 from octoseg_ti.stages.neighbors import PASSES, neighbor_normals
 from octoseg_ti.stages.normals import edge_pair_normals
@@ -119,8 +119,9 @@ def clean(scans: Scans, params: Params) -> tuple[Arranged, Measurement, Params]:
             params,
         )
     along, across = stripe_spacing(arranged.points, arranged.start, arranged.run, arranged.view)
+    rough = stripe_roughness(arranged.points, arranged.start, arranged.run)
     measured = Measurement(
-        spacing_along=along or across, spacing_across=across or along, noise=0.0, normal_noise=0.0
+        spacing_along=along or across, spacing_across=across or along, noise=rough, normal_noise=0.0
     )
     derived = derive(params, measured)
     params = replace(
@@ -129,14 +130,21 @@ def clean(scans: Scans, params: Params) -> tuple[Arranged, Measurement, Params]:
         # How to filter the normals is known when their noise is.
         normals=replace(params.normals, gap=derived.normals.gap),
     )
-    assert params.cleaning.spike is not None and params.cleaning.isolation is not None
-    if params.cleaning.enabled:
+    chosen = params.cleaning
+    assert chosen.spike is not None and chosen.isolation is not None
+    assert chosen.detached is not None
+    if chosen.enabled:
         marked = mark_outliers(
             arranged.points,
             arranged.start,
             arranged.run,
-            spike=params.cleaning.spike,
-            isolation=params.cleaning.isolation,
+            arranged.view,
+            scans.T_world_view if scans.frame == "view" else None,
+            spike=chosen.spike,
+            isolation=chosen.isolation,
+            detached=chosen.detached,
+            along=measured.spacing_along,
+            across=measured.spacing_across,
         )
         if marked.any():
             arranged = without(arranged, marked > 0, len(scans))

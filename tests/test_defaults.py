@@ -13,6 +13,7 @@ from octoseg_ti.params import (
     Params,
     RegionParams,
     RegistrationParams,
+    SurfaceParams,
 )
 from octoseg_ti.types import Measurement
 
@@ -53,18 +54,19 @@ def test_noise_raises_the_tolerance_and_the_spike() -> None:
         assert params.grid.tolerance >= min(1.0, 2 * noisy.normal_noise)
         assert params.grid.edge_tolerance >= params.grid.tolerance
         assert 0.1 <= params.regions.homogeneity <= 0.35
-        assert params.cleaning.spike >= 6 * noisy.noise
+        assert params.cleaning.spike >= 4 * noisy.noise
     assert tolerances == sorted(tolerances) and spikes == sorted(spikes)
     assert tolerances[-1] == 1.0  # sigma is never above
 
 
 def test_given_values_stay() -> None:
     given = Params(
-        cleaning=CleaningParams(spike=0.7, isolation=8.0),
+        cleaning=CleaningParams(spike=0.7, isolation=8.0, detached=9),
         normals=NormalParams(gap=0.9, weight="area", smooth=4),
         registration=RegistrationParams(reach=2.5),
         grid=GridParams(tolerance=0.2, edge_tolerance=0.25, min_cell=3.0, divisions=7),
         regions=RegionParams(homogeneity=0.5, min_points=11),
+        surfaces=SurfaceParams(noise=0.1, tilt=0.2),
     )
     assert derive(given, CLEAN) == given
 

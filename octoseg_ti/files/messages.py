@@ -43,6 +43,7 @@ PARAMS_FIELDS = (
     ("cleaning_enabled", "bool"),
     ("cleaning_spike", "double"),
     ("cleaning_isolation", "double"),
+    ("cleaning_detached", "double"),
     ("normals_rule", "string"),
     ("normals_gap", "double"),
     ("normals_weight", "string"),

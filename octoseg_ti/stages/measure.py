@@ -15,6 +15,8 @@ from octoseg_ti.stages.sampling import sample_stripes, trimmed_mean
 # scale.
 _HALF_NORMAL_TRIMMED = 0.5149
 _RAYLEIGH_TRIMMED = 0.9558
+_HALF_NORMAL_QUARTILE = 1.1503  # three quarters of |x| lie below
+_QUARTILE = 0.75
 
 
 @ti.kernel
@@ -59,6 +61,28 @@ def _measure_spacing(
                             j = k
                             moving = 1
             across_out[s] = ti.cast(best, ti.f32)
+
+
+@ti.kernel
+def _measure_roughness(
+    # In:
+    sample_in: I32Array,
+    point_in: F64Rows,
+    start_in: I32Array,
+    run_in: I32Array,
+    # Out:
+    off_out: F32Array,
+):
+    """Write the distance of a point from the line through its two neighbours on the stripe."""
+    for s in sample_in:
+        off_out[s] = -1.0
+        i = sample_in[s]
+        if i > start_in[run_in[i]] and i + 1 < start_in[run_in[i] + 1]:
+            a = row(point_in, i - 1)
+            along = row(point_in, i + 1) - a
+            p = row(point_in, i) - a
+            t = p.dot(along) / ti.max(along.norm_sqr(), 1e-300)
+            off_out[s] = ti.cast((p - t * along).norm(), ti.f32)
 
 
 @ti.kernel
@@ -137,6 +161,40 @@ def stripe_spacing(
         across,
     )
     return _median(runtime.download(along)), _median(runtime.download(across))
+
+
+def stripe_roughness(points: np.ndarray, start: np.ndarray, run: np.ndarray) -> float:
+    """Return the noise across the stripes' own direction, for want of normals [mm].
+
+    Unlike `stripe_noise` it sees little of the noise where a stripe runs along the line of sight.
+
+    Args:
+        points: Positions [mm], shape (N, 3), f64, in stripe order.
+        start: First point of every stripe, and N at the end, shape (S + 1,), i32.
+        run: Index of the stripe of every point, shape (N,), i32.
+
+    Returns:
+        Standard deviation; 0 where nothing could be measured.
+    """
+    runtime.ensure_started()
+    sample = sample_stripes(start)
+    off = runtime.empty(len(sample), np.float32)
+    _measure_roughness(
+        runtime.upload(sample),
+        runtime.upload(points),
+        runtime.upload(start),
+        runtime.upload(run),
+        off,
+    )
+    known = runtime.download(off)
+    known = np.sort(known[known >= 0])
+    if len(known) == 0:
+        return 0.0
+    # A quantile, and no mean of what lies below: where positions come in coarse steps, most points
+    # of a stripe lie exactly on one.
+    upper = float(known[int(_QUARTILE * (len(known) - 1))])
+    # The point itself and half of either neighbour: 1 + 1/4 + 1/4 of its variance.
+    return upper / _HALF_NORMAL_QUARTILE / float(np.sqrt(1.5))
 
 
 def stripe_noise(

@@ -14,35 +14,43 @@ def runs(start: np.ndarray) -> list[range]:
     return [range(int(a), int(b)) for a, b in pairwise(start)]
 
 
-def to_segment(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Return the distance of a point from a segment."""
+def to_line(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+    """Return the distance of a point from a line."""
     length = float((b - a) @ (b - a))
-    t = 0.0 if length == 0.0 else min(1.0, max(0.0, float((p - a) @ (b - a)) / length))
+    t = 0.0 if length == 0.0 else float((p - a) @ (b - a)) / length
     return float(np.linalg.norm(p - (a + t * (b - a))))
 
 
-def mark_outliers(
-    points: np.ndarray, start: np.ndarray, *, spike: float, isolation: float
-) -> np.ndarray:
-    """Mark points without a neighbour, and points off the three lines through four neighbours."""
-    marked = np.zeros(len(points), int)
+def doubtful(
+    points: np.ndarray, start: np.ndarray, *, off: float, step: float, far: float, short: int
+) -> list[int]:
+    """Return points off every line beside them, and those of short pieces between steps."""
+    rows = set()
     for stripe in runs(start):
+        pieces: list[list[int]] = [[]]
         for i in stripe:
-            beside = [points[j] for j in (i - 1, i + 1) if j in stripe]
-            if all(np.linalg.norm(points[i] - q) > isolation for q in beside):
-                marked[i] = 1
-                continue
-            if i - 2 not in stripe or i + 2 not in stripe:
-                continue
-            far_left, left, right, far_right = (points[i + k] for k in (-2, -1, 1, 2))
-            off = min(
-                to_segment(points[i], far_left, left),
-                to_segment(points[i], left, right),
-                to_segment(points[i], right, far_right),
-            )
-            if off > spike and np.linalg.norm(left - right) < isolation:
-                marked[i] = 1
-    return marked
+            lines = [(i - 1, i + 1), (i - 2, i - 1), (i + 1, i + 2)]
+            known = [line for line in lines if all(j in stripe for j in line)]
+            if all(to_line(points[i], *(points[j] for j in line)) > off for line in known):
+                rows.add(i)
+            pieces[-1].append(i)
+            if i + 1 in stripe and np.linalg.norm(points[i + 1] - points[i]) > step:
+                joined = False
+                if i - 1 in stripe:
+                    joined |= to_line(points[i + 1], points[i - 1], points[i]) <= off
+                if i + 2 in stripe:
+                    joined |= to_line(points[i], points[i + 1], points[i + 2]) <= off
+                if not joined or np.linalg.norm(points[i + 1] - points[i]) > far:
+                    pieces.append([])
+        rows.update(i for piece in pieces if len(piece) < short for i in piece)
+    return sorted(rows)
+
+
+def stripe_roughness(points: np.ndarray, start: np.ndarray) -> float:
+    """Return the noise from the distances to the line through the two neighbours [mm]."""
+    off = [to_line(points[i], points[i - 1], points[i + 1]) for s in runs(start) for i in s[1:-1]]
+    upper = sorted(off)[int(0.75 * (len(off) - 1))] if off else 0.0
+    return upper / NormalDist().inv_cdf(0.875) / math.sqrt(1.5)
 
 
 def stripe_spacing(points: np.ndarray, start: np.ndarray, view: np.ndarray) -> tuple[float, float]:

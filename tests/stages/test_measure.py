@@ -5,7 +5,7 @@ import pytest
 from reference import stripes as plain
 from reference.clouds import lattice_stripes, ragged_stripes, unit
 
-from octoseg_ti.stages.measure import stripe_noise, stripe_spacing
+from octoseg_ti.stages.measure import stripe_noise, stripe_roughness, stripe_spacing
 from octoseg_ti.stages.normals import edge_pair_normals
 
 
@@ -29,6 +29,24 @@ def test_noise_equals_the_reference(seed: int, stripes: int, length: int, lag: i
     expected = plain.stripe_noise(points, normals, start, 0.8, lag)
     # The kernel's constants have four digits.
     assert got == pytest.approx(expected, rel=3e-4), f"seed {seed}"
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("stripes", "length"), [(2, 3), (5, 20), (25, 80)])
+def test_roughness_equals_the_reference(seed: int, stripes: int, length: int) -> None:
+    points, start, run, _ = ragged_stripes(seed, stripes, length)
+    got = stripe_roughness(points, start, run)
+    assert got == pytest.approx(plain.stripe_roughness(points, start), rel=1e-3), f"seed {seed}"
+
+
+@pytest.mark.parametrize("step", [0.0, 0.1])
+def test_roughness_is_the_noise_also_in_coarse_steps(step: float) -> None:
+    rng = np.random.default_rng(2)
+    x, y = 0.5 * np.arange(60)[:, None], 0.5 * np.arange(150)[None, :]
+    z = 0.05 * x + 0.03 * y + 0.05 * rng.standard_normal((60, 150))
+    points, start, run, _ = lattice_stripes(x, y, np.rint(z / step) * step if step else z)
+    # In coarse steps a quantile is one of few values.
+    assert stripe_roughness(points, start, run) == pytest.approx(0.05, rel=0.6 if step else 0.05)
 
 
 @pytest.mark.parametrize("noise", [0.002, 0.02, 0.1])
@@ -69,6 +87,7 @@ def test_what_cannot_be_measured_is_zero() -> None:
     start, run = np.array([0, 1, 2], np.int32), np.array([0, 1], np.int32)
     assert stripe_spacing(points, start, run, np.array([0, 1], np.int32)) == (0.0, 0.0)
     assert stripe_noise(points, np.zeros((2, 3)), start, run, 1.0) == (0.0, 0.0)
+    assert stripe_roughness(points, start, run) == 0.0
 
 
 def test_the_order_of_views_changes_nothing() -> None:
@@ -81,6 +100,9 @@ def test_the_order_of_views_changes_nothing() -> None:
     views = np.concatenate((view[n:] * 0, view[:n] + 1)).astype(np.int32)
     assert stripe_spacing(swapped, starts.astype(np.int32), runs, views) == stripe_spacing(
         points, start, run, view
+    )
+    assert stripe_roughness(swapped, starts.astype(np.int32), runs) == stripe_roughness(
+        points, start, run
     )
     normals = unit(np.random.default_rng(0).standard_normal(points.shape))
     moved = np.concatenate((normals[n:], normals[:n]))
