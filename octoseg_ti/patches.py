@@ -10,13 +10,12 @@ import numpy as np
 from octoseg_ti.arrange import Arranged
 from octoseg_ti.defaults import spacing_of
 from octoseg_ti.device import runtime
-from octoseg_ti.params import Params
 from octoseg_ti.device.surfaces import evaluate_surfaces
+from octoseg_ti.params import Params
 from octoseg_ti.stages.adjacency import Adjacency, find_touching
 from octoseg_ti.stages.assignment import (
     assign_points,
     claimed_share,
-    points_in,
     points_of_leaves,
     to_rows,
 )

@@ -101,9 +101,7 @@ def segment(
     with stage("surfaces"):
         measured, params, found = explain_regions(grid, leaves, found, measured, params, asked)
     with stage("patches"):
-        result = assemble(
-            scans, arranged, point, normal, grid, leaves, found, measured, params
-        )
+        result = assemble(scans, arranged, point, normal, grid, leaves, found, measured, params)
     if aligned is not None:
         result = with_registration(result, scans, aligned)
     return replace(result, seconds=trace.seconds)

@@ -105,9 +105,7 @@ class _Search:
         self, samples: Samples, sets: list[np.ndarray], whole_only: np.ndarray | None = None
     ) -> bool:
         """Explain sets of samples; say whether that gave any new surface."""
-        new, label = explain(
-            samples, self.leaves, sets, self.tolerance, whole_only=whole_only
-        )
+        new, label = explain(samples, self.leaves, sets, self.tolerance, whole_only=whole_only)
         for members in sets:
             large = samples.weight[members].sum() >= _FREE * self.tolerance.points
             if large and not np.any(label[members] >= 0):
@@ -134,9 +132,7 @@ class _Search:
         noise = self.tolerance.noise
         fitted, fits = fit_sets(self.samples, sets, noise, robust=True)
         new = lie_on(self.samples, sets, fitted, fits, 3.0 * noise, 0.5)
-        old = lie_on(
-            self.samples, sets, fitted, self.surfaces.at(which[fitted]), 3.0 * noise, 0.5
-        )
+        old = lie_on(self.samples, sets, fitted, self.surfaces.at(which[fitted]), 3.0 * noise, 0.5)
         kind, parameters = self.surfaces.kind.copy(), self.surfaces.parameters.copy()
         for k, f in enumerate(fitted):
             if new[k].mean() >= old[k].mean() - 0.01:
@@ -221,9 +217,7 @@ def find_surfaces(
     part = group[samples.leaf]
     size = np.bincount(group[group >= 0], leaves.count[group >= 0], minlength=1)
     sets = [
-        s
-        for s in members_of(part, len(size))
-        if len(s) and size[part[s[0]]] >= tolerance.points
+        s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= tolerance.points
     ]
     flat = np.array([face[samples.leaf[s[0]]] for s in sets], bool)
     for turn in range(_ROUNDS):

@@ -204,9 +204,7 @@ def fit_sets(
     return _simplest_of(_fit(samples, sets, noise, robust=robust), noise)
 
 
-def _fit(
-    samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool = False
-) -> Fits:
+def _fit(samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool = False) -> Fits:
     """Fit all kinds of surfaces to every set of samples."""
     start = np.cumsum([0] + [len(s) for s in sets])
     index = np.concatenate(sets)
@@ -250,7 +248,7 @@ def explain(
     fitted, whole = _simplest_of(fits, noise)
     turn = max(tolerance.turn, 0.5)
     on = lie_on(samples, sets, fitted, whole, (_ON + 0.5) * noise, turn)
-    kept = []
+    kept: list[int] = []
     for m, (s, there) in enumerate(zip(fitted, on, strict=True)):
         weight = samples.weight[sets[s]]
         if weight[there].sum() >= _WHOLE * weight.sum():

@@ -1,8 +1,12 @@
 """Surfaces that are one are merged; surfaces that their neighbours explain are given up."""
 
+from itertools import pairwise
+
 import numpy as np
 
-from octoseg_ti.stages.extraction import Surfaces, fit_sets, lie_on, spread
+from octoseg_ti.device.surfaces import evaluate_surfaces
+from octoseg_ti.device.unionfind import components
+from octoseg_ti.stages.extraction import Surfaces, fit_sets, spread
 from octoseg_ti.stages.leaves import Leaves, Samples
 from octoseg_ti.types import NONE
 
@@ -54,7 +58,7 @@ def members_of(label: np.ndarray, count: int) -> list[np.ndarray]:
     """Return the samples of every label, ascending, an array of indices for each."""
     order = np.argsort(label, kind="stable")
     ends = np.searchsorted(label[order], np.arange(count + 1))
-    return [order[lo:hi] for lo, hi in zip(ends[:-1], ends[1:], strict=True)]
+    return [order[lo:hi] for lo, hi in pairwise(ends)]
 
 
 def merge_surfaces(
@@ -129,8 +133,6 @@ def capped_rms(
         surfaces: The surfaces.
         noise: Deviation of a point from its surface [mm]; distances count as 4 of it at most.
     """
-    from octoseg_ti.device.surfaces import evaluate_surfaces
-
     length = np.array([len(s) for s in sets], np.int64)[which]
     index = np.concatenate([sets[w] for w in which])
     owner = np.repeat(np.arange(len(which)), length)
@@ -208,8 +210,6 @@ def pieces(leaves: Leaves, own: np.ndarray, count: int) -> np.ndarray:
         Piece of every entry of ``own``, named by its first entry, -1 where there is none; shape
         (C, most), i32.
     """
-    from octoseg_ti.device.unionfind import components
-
     most = own.shape[1]
     entry = np.flatnonzero(own.ravel() >= 0)
     number = np.full(own.size, NONE, np.int64)
