@@ -56,6 +56,17 @@ def test_it_can_be_asked_for_and_switched_off(tents) -> None:
     assert np.abs(asked.normals - off.normals).max() > 0.05
 
 
+@pytest.mark.parametrize("height", [0.0, 1.0])
+def test_clean_normals_may_be_filtered_too(height: float) -> None:
+    x, y = (a.ravel() for a in np.mgrid[0:20, 0:30] * 0.5)
+    points = np.column_stack((x, y, height * np.sin(0.2 * y)))
+    stripe = (2 * x).astype(np.int32)
+    answer = segment(points, Params(normals=NormalParams(smooth=3)), stripe=stripe)
+    assert answer.params.normals.smooth == 3
+    assert np.all(np.isfinite(answer.normals))
+    np.testing.assert_allclose(np.linalg.norm(answer.normals, axis=1), 1.0, atol=1e-6)
+
+
 def test_the_paper_does_not_filter(tents) -> None:
     assert segment(tents[0.1][0], paper()).params.normals.smooth == 0
 

@@ -333,7 +333,7 @@ def filter_normals(
     step = 1
     while True:
         _link(step, gap, point, raw, starts, runs, partner, ring)
-        _average_near(1.0 / (_GATE * noise) ** 2, ring, old, new)
+        _average_near(1.0 / (_GATE * max(noise, 1e-6)) ** 2, ring, old, new)
         old, new, spare = new, spare, new
         if step >= lag:
             break
