@@ -429,7 +429,7 @@ def build_grid(
     sizes = size / 2.0 ** np.arange(AXIS_BITS + 1)
     return Grid(
         corner=corner, size=size, shape=shape, depth=depth, signed=signed, count=count, order=order,
-        point=sorted_point, normal=sorted_normal, key=key, root=root, node=node, child=child, mean=mean, moment=moment,
-        passes=passes,
+        point=sorted_point, normal=sorted_normal, key=key, root=root, node=node, child=child,
+        mean=mean, moment=moment, passes=passes,
         first=lo, holds=host[:, HI] - lo, edge_length=sizes[host[:, LEVEL]],
     )  # fmt: skip

@@ -70,7 +70,7 @@ def _gather(
     # Out:
     near_inout: I32Rows,
 ):
-    """Collect the surfaces of every leaf and of the leaves that touch it; none where it is closed."""
+    """Collect the surfaces of every leaf that is not closed, and of the leaves that touch it."""
     for c in range(own_in.shape[0]):
         for k in range(MOST):
             near_inout[c, k] = -1
