@@ -102,10 +102,10 @@ class _Search:
         )
 
     def add(
-        self, samples: Samples, sets: list[np.ndarray], whole_only: np.ndarray | None = None
+        self, samples: Samples, sets: list[np.ndarray], face: np.ndarray | None = None
     ) -> bool:
         """Explain sets of samples; say whether that gave any new surface."""
-        new, label = explain(samples, self.leaves, sets, self.tolerance, whole_only=whole_only)
+        new, label = explain(samples, self.leaves, sets, self.tolerance, face=face)
         for members in sets:
             large = samples.weight[members].sum() >= _FREE * self.tolerance.points
             if large and not np.any(label[members] >= 0):
@@ -206,8 +206,7 @@ def find_surfaces(
         grid: The sparse grid.
         leaves: Its leaves.
         group: Group of every leaf that the flood fill reached, -1 = none, shape (C,), i32.
-        face: Leaves of flat faces that were cut apart at bends, shape (C,), bool: each is one
-            surface or none.
+        face: Leaves of flat faces that were cut apart at bends, shape (C,), bool.
         tolerance: What counts as lying on a surface.
         rule: What a point may differ from the surface that it takes.
     """

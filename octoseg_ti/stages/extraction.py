@@ -6,6 +6,7 @@ long as fitting it anew lets it explain more (Besl and Jain 1988), and takes wha
 """
 
 from dataclasses import dataclass
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +36,8 @@ _FIT = 1.5
 _ON = 3.0
 # A surface explains a set when this share of it lies on it.
 _WHOLE = 0.85
+# ... and for sure when it leaves no more than this many noises there.
+_SURE = 0.9
 # Samples for one fit of a set, and of a growing surface.
 _MANY, _SOME = 200, 150
 # Neighbourhoods of a seed, in samples.
@@ -48,7 +51,7 @@ _LEFT = 0.005
 # Surfaces that a set was taken apart into are real when they explain so much of it, and leave no
 # more than this many noises, fewer the less they explain: pieces of a free form are cut out as far
 # as they just fit, and leave gaps.
-_COVERED, _REAL = 0.6, 1.15
+_COVERED, _REAL, _REAL_FACE = 0.6, 1.15, 0.95
 
 
 class Tolerance(NamedTuple):
@@ -226,7 +229,7 @@ def explain(
     sets: list[np.ndarray],
     tolerance: Tolerance,
     *,
-    whole_only: np.ndarray | None = None,
+    face: np.ndarray | None = None,
 ) -> tuple[Surfaces, np.ndarray]:
     """Find the surfaces that explain sets of samples.
 
@@ -235,7 +238,8 @@ def explain(
         leaves: The leaves.
         sets: Samples that belong together, ascending, an array of indices for every set.
         tolerance: What counts as lying on a surface.
-        whole_only: Sets that are not taken apart, shape (len(sets),), bool; None = no set.
+        face: Sets that are one flat face already, shape (len(sets),), bool; None = no set. They
+            have to come apart more clearly than others.
 
     Returns:
         The surfaces, and the one that every sample lies on, -1 = none, shape (A,), i32.
@@ -248,20 +252,41 @@ def explain(
     fitted, whole = _simplest_of(fits, noise)
     turn = max(tolerance.turn, 0.5)
     on = lie_on(samples, sets, fitted, whole, (_ON + 0.5) * noise, turn)
+    likely, sure = np.zeros(len(sets), bool), np.zeros(len(sets), bool)
+    for s, there, rms in zip(fitted, on, _rms_on(samples, sets, fitted, whole, on), strict=True):
+        weight = samples.weight[sets[s]]
+        likely[s] = weight[there].sum() >= _WHOLE * weight.sum()
+        sure[s] = likely[s] and rms <= _SURE * noise
+    limit = np.full(len(sets), _REAL) if face is None else np.where(face, _REAL_FACE, _REAL)
+    more, found = _take_apart(
+        samples, leaves, list(compress(sets, ~sure)), tolerance, limit[~sure] * noise
+    )
     kept: list[int] = []
     for m, (s, there) in enumerate(zip(fitted, on, strict=True)):
-        weight = samples.weight[sets[s]]
-        if weight[there].sum() >= _WHOLE * weight.sum():
+        if likely[s] and not np.any(found[sets[s]] >= 0):
             label[sets[s][there]] = len(kept)
             kept.append(m)
-    done = np.zeros(len(sets), bool)
-    done[fitted[kept]] = True
-    if whole_only is not None:
-        done |= whole_only
-    rest = [s for s, d in zip(sets, done, strict=True) if not d]
-    more, found = _take_apart(samples, leaves, rest, tolerance)
     label[found >= 0] = found[found >= 0] + len(kept)
     return whole.at(np.array(kept, np.int64)).joined(more), label
+
+
+def _rms_on(
+    samples: Samples,
+    sets: list[np.ndarray],
+    which: np.ndarray,
+    surfaces: Surfaces,
+    on: list[np.ndarray],
+) -> np.ndarray:
+    """Return the residual of the samples that lie on every surface [mm], shape (M,)."""
+    lying = [sets[s][there] for s, there in zip(which, on, strict=True)]
+    count = np.array([len(i) for i in lying], np.int64)
+    if count.sum() == 0:
+        return np.full(len(count), np.inf)
+    owner = np.repeat(np.arange(len(count)), count)
+    far, _ = evaluate_surfaces(
+        samples.point[np.concatenate(lying)], owner, surfaces.kind, surfaces.parameters
+    )
+    return np.sqrt(np.bincount(owner, far**2, len(count)) / np.maximum(count, 1))
 
 
 def _neighborhoods(point: np.ndarray, seeds: np.ndarray, count: int) -> np.ndarray:
@@ -340,9 +365,13 @@ class _Set:
 
 
 def _take_apart(
-    samples: Samples, leaves: Leaves, sets: list[np.ndarray], tolerance: Tolerance
+    samples: Samples,
+    leaves: Leaves,
+    sets: list[np.ndarray],
+    tolerance: Tolerance,
+    real: np.ndarray,
 ) -> tuple[Surfaces, np.ndarray]:
-    """Find the surfaces of sets that no single one explains."""
+    """Find the surfaces of sets that no single one explains; they may leave so much [mm]."""
     label = np.full(len(samples), NONE, np.int32)
     found = no_surfaces()
     if not sets:
@@ -375,15 +404,15 @@ def _take_apart(
             w.on[:, ~w.free[w.scored]] = 0.0
             if w.weight[w.free].sum() < max(_LEFT * w.weight.sum(), tolerance.points):
                 active.remove(s)
-    return _real_ones(samples, sets, found, label, _REAL * noise)
+    return _real_ones(samples, sets, found, label, real)
 
 
 def _real_ones(
-    samples: Samples, sets: list[np.ndarray], found: Surfaces, label: np.ndarray, limit: float
+    samples: Samples, sets: list[np.ndarray], found: Surfaces, label: np.ndarray, limit: np.ndarray
 ) -> tuple[Surfaces, np.ndarray]:
     """Drop the surfaces of sets that are free forms."""
     real = np.zeros(len(found) + 1, bool)
-    for members in sets:
+    for members, most in zip(sets, limit, strict=True):
         name, weight = label[members], samples.weight[members]
         on = name >= 0
         covered = weight[on].sum() / weight.sum()
@@ -393,7 +422,7 @@ def _real_ones(
             samples.point[members[on]], name[on], found.kind, found.parameters
         )
         rms = np.sqrt(np.average(far**2, weights=weight[on]))
-        real[name[on]] = rms <= covered * limit
+        real[name[on]] = rms <= covered * most
     kept = np.flatnonzero(real[:-1])
     number = np.full(len(real), NONE, np.int32)
     number[kept] = np.arange(len(kept), dtype=np.int32)
