@@ -21,7 +21,7 @@ TUKEY = 4.685
 
 _ROUNDS = 12
 _BINS = 64  # of distances: quarters of a power of two, up to the extent of the group
-_NARROWED = 2  # times that every surface takes its own spread for scale, before they share one
+_NARROWED = 5  # times that every surface takes its own spread for scale, before they share one
 _SUMS = 8
 
 
@@ -204,6 +204,7 @@ class _Samples:
         counts = runtime.download(bins)[: tasks * _BINS].reshape(self.groups, KINDS, _BINS)
         below = np.cumsum(counts, axis=-1)
         half = np.argmax(2 * below >= below[..., -1:], axis=-1)
+        half[~np.isfinite(parameters[..., 0])] = _BINS
         return 1.4826 * least[:, None] * 2.0 ** ((half + 0.5) / 4.0)
 
     def sums(self, parameters: np.ndarray, reach: np.ndarray) -> np.ndarray:
@@ -262,20 +263,28 @@ def fit_all(
     samples = _Samples(points, normals, weight, start)
     given = samples.points, samples.weight, start, frame
     reach = np.full((groups, KINDS), np.inf)
-    state = starts(points, normals, weight, start, m)
+    first = starts(points, normals, weight, start, m)
     state, normal = iterate(
-        *given, reach, state, rounds=_ROUNDS, whole=not robust, leave=not robust
+        *given, reach, first, rounds=_ROUNDS, whole=not robust, leave=not robust
     )
     scale = np.broadcast_to(np.asarray(noise, np.float64), groups)[:, None]
+    # Least squares may have followed the outliers to a wrong place: then a start is better.
+    tries = np.concatenate((state[None], first)) if robust else state[None]
     for narrowed in range(_NARROWED + 1 if robust else 0):
-        spread = samples.spread(to_parameters(state, m.centre, extent), extent)
-        last = narrowed == _NARROWED
-        if last:
+        spreads = [samples.spread(to_parameters(s, m.centre, extent), extent) for s in tries]
+        spread = np.min(spreads, axis=0)
+        if narrowed == _NARROWED:
             spread = np.repeat(spread.min(axis=1, keepdims=True), KINDS, axis=1)
         reach = TUKEY * np.maximum(spread, scale)
         state, normal = iterate(
-            *given, reach / extent[:, None], state[None], rounds=_ROUNDS, whole=last, leave=False
+            *given,
+            reach / extent[:, None],
+            tries,
+            rounds=_ROUNDS,
+            whole=narrowed == _NARROWED,
+            leave=False,
         )
+        tries = state[None]
     parameters = to_parameters(state, m.centre, extent)
     sums = samples.sums(parameters, reach)
     count = np.diff(start)
