@@ -21,7 +21,8 @@ TUKEY = 4.685
 
 _ROUNDS = 12
 _BINS = 64  # of distances: quarters of a power of two, up to the extent of the group
-_NARROWED = 5  # times that every surface takes its own spread for scale, before they share one
+_NARROWED = 6  # most times that surfaces are fitted to the spread that they left, the last together
+_SETTLED = 0.9  # of the spread before: it is not to shrink any more
 _SUMS = 8
 
 
@@ -270,19 +271,19 @@ def fit_all(
     scale = np.broadcast_to(np.asarray(noise, np.float64), groups)[:, None]
     # Least squares may have followed the outliers to a wrong place: then a start is better.
     tries = np.concatenate((state[None], first)) if robust else state[None]
-    for narrowed in range(_NARROWED + 1 if robust else 0):
+    before, last = np.full((groups, KINDS), np.inf), not robust
+    for narrowed in range(1, _NARROWED + 1):
+        if last:
+            break
         spreads = [samples.spread(to_parameters(s, m.centre, extent), extent) for s in tries]
-        spread = np.min(spreads, axis=0)
-        if narrowed == _NARROWED:
+        spread = np.maximum(np.min(spreads, axis=0), scale)
+        last = narrowed == _NARROWED or bool(np.all(spread > _SETTLED * before))
+        before = spread
+        if last:
             spread = np.repeat(spread.min(axis=1, keepdims=True), KINDS, axis=1)
-        reach = TUKEY * np.maximum(spread, scale)
+        reach = TUKEY * spread
         state, normal = iterate(
-            *given,
-            reach / extent[:, None],
-            tries,
-            rounds=_ROUNDS,
-            whole=narrowed == _NARROWED,
-            leave=False,
+            *given, reach / extent[:, None], tries, rounds=_ROUNDS, whole=last, leave=False
         )
         tries = state[None]
     parameters = to_parameters(state, m.centre, extent)
