@@ -244,7 +244,8 @@ def fit_all(
         weight: Weight of every sample, shape (S,), f64, not negative; None = 1.
         start: First sample of every group, and S at the end, shape (G + 1,), i32.
         noise: Deviation of a point from its surface [mm], of all or of every group, shape (G,):
-            the least scale by which ``robust`` judges a point.
+            the least scale by which ``robust`` judges a point. Give it: a robust fit to exact data
+            may settle on a few points that happen to agree.
         robust: Take the weight from points far off (Tukey's biweight, scale from the median
             distance), so that up to a fifth of the points may belong to something else.
 
@@ -333,12 +334,12 @@ def covariance(fits: Fits, kind: np.ndarray) -> np.ndarray:
     deviation = np.nan_to_num(fits.rms[rows, kind]) * np.sqrt(fits.count / count) / fits.extent
     root *= deviation[:, None, None]
     change = np.empty((len(kind), 8, FREE.shape[1]))
+    here = to_parameters(fits.state, fits.centre, fits.extent)
     small = 1e-6
     for k in range(FREE.shape[1]):
         step = np.zeros((len(kind), KINDS, FREE.shape[1]))
         step[..., k] = small
         ahead = to_parameters(moved(fits.state, step), fits.centre, fits.extent)
-        behind = to_parameters(moved(fits.state, -step), fits.centre, fits.extent)
-        change[..., k] = np.nan_to_num((ahead - behind)[rows, kind]) / (2.0 * small)
+        change[..., k] = np.nan_to_num((ahead - here)[rows, kind]) / small
     root = change @ root
     return root @ np.swapaxes(root, 1, 2)
