@@ -18,18 +18,9 @@ from octoseg_ti.device.surfaces import KINDS, evaluate_surfaces, surface_at
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.stages.leaves import Leaves, Samples
 from octoseg_ti.stages.primitives import Fits, fit_all
-from octoseg_ti.types import NONE, SurfaceKind
+from octoseg_ti.stages.selection import choose
+from octoseg_ti.types import NONE
 
-# The simplest surface first.
-_SIMPLEST = (
-    SurfaceKind.PLANE,
-    SurfaceKind.SPHERE,
-    SurfaceKind.CYLINDER,
-    SurfaceKind.CONE,
-    SurfaceKind.TORUS,
-)
-# A simpler surface is taken when its residual is larger by no more than this.
-_SIMPLER = 1.1
 # A surface fits when its residual is below this many noises.
 _FIT = 1.5
 # A sample lies on a surface within this many noises.
@@ -175,25 +166,6 @@ def spread(members: np.ndarray, most: int) -> np.ndarray:
     return members[(2 * np.arange(most) + 1) * len(members) // (2 * most)]
 
 
-def simplest(rms: np.ndarray, noise: float) -> np.ndarray:
-    """Return the simplest kind whose residual is no worse than the best, or within the noise.
-
-    Args:
-        rms: Residual of every kind [mm], NaN = no such surface, shape (G, 5).
-        noise: Deviation of a point from its surface [mm].
-
-    Returns:
-        `SurfaceKind`, FREE_FORM where no kind fits, shape (G,), i32.
-    """
-    residual = np.where(np.isfinite(rms), rms, np.inf)
-    limit = np.maximum(_SIMPLER * residual.min(axis=1), noise)
-    limit = np.minimum(limit, _FIT * noise)
-    kind = np.full(len(rms), int(SurfaceKind.FREE_FORM), np.int32)
-    for k in reversed(_SIMPLEST):
-        kind[residual[:, k] <= limit] = int(k)
-    return kind
-
-
 def fit_sets(
     samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool = False
 ) -> tuple[np.ndarray, Surfaces]:
@@ -218,9 +190,11 @@ def _fit(samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool
 
 def _simplest_of(fits: Fits, noise: float) -> tuple[np.ndarray, Surfaces]:
     """Return which fits give a surface, and the simplest of each."""
-    kind = simplest(fits.rms, noise)
-    fitted = np.flatnonzero(kind < KINDS)
-    return fitted, Surfaces(kind=kind[fitted], parameters=fits.parameters[fitted, kind[fitted]])
+    chosen = choose(fits, noise=noise, room=_FIT)
+    fitted = np.flatnonzero((chosen.kind >= 0) & (chosen.kind < KINDS))
+    return fitted, Surfaces(
+        kind=chosen.kind[fitted].astype(np.int32), parameters=chosen.parameters[fitted]
+    )
 
 
 def explain(
