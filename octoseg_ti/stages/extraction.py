@@ -42,7 +42,7 @@ _LEFT = 0.005
 # Surfaces that a set was taken apart into are real when they explain so much of it, and leave no
 # more than this many noises, fewer the less they explain: pieces of a free form are cut out as far
 # as they just fit, and leave gaps.
-_COVERED, _REAL = 0.6, 1.15
+_COVERED, _REAL = 0.6, 1.0
 
 
 class Tolerance(NamedTuple):
