@@ -20,7 +20,7 @@ from scanner_sim.line_profile import Fan, Peaks
 from scanner_sim.optics import merging, pixels_per_slope, shine, sub_rays
 from scanner_sim.part import FlatPart
 from scanner_sim.quadric import gradient
-from scanner_sim.raycast import ANY_INTO, FIRST_INTO, nearest_hit
+from scanner_sim.raycast import ANY_INTO, FIRST_INTO, nearest_hit, upload_program
 from scanner_sim.scanner import StripeScanner
 from scanner_sim.target import LIFT, CsgTarget
 
@@ -281,20 +281,14 @@ def _find_peaks(
                 hit_out[i, n] = ti.i32(spots_in[i, 4 * spot + n])
 
 
-def peaks_of_solid(solid: CsgTarget, scanner: StripeScanner, fan: Fan, middle: np.ndarray) -> Peaks:
+def peaks_of_solid(solid: CsgTarget, scanner: StripeScanner, fan: Fan) -> Peaks:
     """Return the peaks of some stripes; see `scanner_sim.line_profile.peaks`."""
     target = solid.flat
     runtime.ensure_started()
-    del middle  # the planes of the view follow from the fan itself
     offsets, shares = sub_rays(scanner)
     line = runtime.upload(np.column_stack([offsets, shares]))
     optics = _optics(scanner, fan.rotation)
-    boxes = target.boxes if len(target.boxes) else np.zeros((1, 6))
-    faces = target.surface_boxes.reshape(-1, 6)
-    part = [
-        runtime.upload(np.ascontiguousarray(a))
-        for a in (target.code, boxes, target.surfaces.kind, target.surfaces.data, faces)
-    ]
+    part = (*upload_program(target), runtime.upload(target.surface_boxes.reshape(-1, 6)))
     ray = runtime.upload(fan.ray)
     columns = len(fan.ray)
     step = max(_CHUNK // columns, 1)

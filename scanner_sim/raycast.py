@@ -68,8 +68,7 @@ def cast(
     surfaces = runtime.empty(count, np.int32)
     sides = runtime.empty(count, np.int32)
     _cast_rays(
-        runtime.upload(part.code), _boxes(part), runtime.upload(part.surfaces.kind),
-        runtime.upload(part.surfaces.data), _rows(part.surface_boxes.reshape(-1, 6)),
+        *upload_program(part), _rows(part.surface_boxes.reshape(-1, 6)),
         _rows(origins), _rows(directions), runtime.upload(limits),
         _ANY * int(any_hit) + _INTO * int(from_outside),
         distances, surfaces, sides,
@@ -98,25 +97,37 @@ def classify(part: FlatPart, points: np.ndarray, surface: np.ndarray) -> np.ndar
         return np.empty(0, np.int32)
     sides = runtime.empty(count, np.int32)
     _classify_points(
-        runtime.upload(part.code), _boxes(part), runtime.upload(part.surfaces.kind),
-        runtime.upload(part.surfaces.data), _rows(points),
-        runtime.upload(np.asarray(surface, np.int32)), sides,
-    )  # fmt: skip
+        *upload_program(part), _rows(points), runtime.upload(np.asarray(surface, np.int32)), sides
+    )
     runtime.sync()
     return runtime.download(sides)[:count]
+
+
+def upload_program(part: FlatPart) -> tuple[object, ...]:
+    """Return the program of a part for kernels: code, boxes, kinds and data of its surfaces."""
+    boxes = part.boxes if len(part.boxes) else np.zeros((1, 6))
+    arrays = (part.code, boxes, part.surfaces.kind, part.surfaces.data)
+    return tuple(runtime.upload(array) for array in arrays)
 
 
 def _rows(values: np.ndarray) -> object:
     return runtime.upload(np.ascontiguousarray(values, np.float64))
 
 
-def _boxes(part: FlatPart) -> object:
-    return runtime.upload(part.boxes if len(part.boxes) else np.zeros((1, 6)))
+@ti.func
+def side_of(bits):
+    """Return 1 when the solid is inside of the surface, -1 when it is outside, else 0."""
+    result = 0
+    if bits == 1:
+        result = -1
+    elif bits == 2:
+        result = 1
+    return result
 
 
 @ti.func
-def _solid_if(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
-              data: ti.template(), p, surface):  # fmt: skip
+def solid_if(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
+             data: ti.template(), p, surface):  # fmt: skip
     """Return two bits: is p solid if it is outside (bit 0) or inside (bit 1) of the surface?"""
     stack = ti.i64(0)
     pc = 0
@@ -226,11 +237,11 @@ def nearest_hit(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
                             slope = surface_normal(kinds[arg], data, arg, p).dot(direction)
                             asked = slope > 0.0 if outside == 1 else slope < 0.0
                         if asked:
-                            bits = _solid_if(code, boxes, kinds, data, p, arg)
-                            if bits == 1 or bits == 2:
+                            found_side = side_of(solid_if(code, boxes, kinds, data, p, arg))
+                            if found_side != 0:
                                 best = t
                                 surface = arg
-                                side = 1 if bits == 2 else -1
+                                side = found_side
     return ti.Vector([best, ti.f64(surface), ti.f64(side)])
 
 
@@ -276,12 +287,5 @@ def _classify_points(
 ):
     """Ask for every point whether its surface decides that it is solid."""
     for i in range(points_in.shape[0]):
-        bits = _solid_if(
-            code_in, boxes_in, kinds_in, data_in, vector(points_in, i, 0), surface_in[i]
-        )
-        side = 0
-        if bits == 1:
-            side = -1
-        elif bits == 2:
-            side = 1
-        sides_out[i] = side
+        p = vector(points_in, i, 0)
+        sides_out[i] = side_of(solid_if(code_in, boxes_in, kinds_in, data_in, p, surface_in[i]))
