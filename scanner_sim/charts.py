@@ -11,7 +11,7 @@ from octoseg_ti.types import SurfaceKind
 from scanner_sim.crossings import vector
 from scanner_sim.part import FlatPart
 from scanner_sim.quadric import frames
-from scanner_sim.raycast import side_of, solid_if, upload_program
+from scanner_sim.raycast import side_at, upload_program
 
 _PLANE, _CYLINDER = int(SurfaceKind.PLANE), int(SurfaceKind.CYLINDER)
 _CONE, _SPHERE = int(SurfaceKind.CONE), int(SurfaceKind.SPHERE)
@@ -153,7 +153,8 @@ def _place_points(
 def _find_sides(
     # In:
     code_in: I32Rows,
-    boxes_in: F64Rows,
+    first_in: I32Array,
+    grid_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
     axes_in: F64Rows,
@@ -166,14 +167,15 @@ def _find_sides(
     for i in range(index_in.shape[0]):
         s = index_in[i]
         p = _point(kinds_in, data_in, axes_in, s, ti.Vector([places_in[i, 0], places_in[i, 1]]))
-        sides_out[i] = side_of(solid_if(code_in, boxes_in, kinds_in, data_in, p, s))
+        sides_out[i] = side_at(code_in, first_in, grid_in, kinds_in, data_in, p, s)
 
 
 @ti.kernel
 def _halve(
     # In:
     code_in: I32Rows,
-    boxes_in: F64Rows,
+    first_in: I32Array,
+    grid_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
     axes_in: F64Rows,
@@ -189,12 +191,11 @@ def _halve(
         low = ti.Vector([inner_in[i, 0], inner_in[i, 1]])
         high = ti.Vector([outer_in[i, 0], outer_in[i, 1]])
         p = _point(kinds_in, data_in, axes_in, s, low)
-        before = solid_if(code_in, boxes_in, kinds_in, data_in, p, s)
+        before = side_at(code_in, first_in, grid_in, kinds_in, data_in, p, s)
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
             p = _point(kinds_in, data_in, axes_in, s, middle)
-            bits = solid_if(code_in, boxes_in, kinds_in, data_in, p, s)
-            if side_of(bits) == side_of(before):
+            if side_at(code_in, first_in, grid_in, kinds_in, data_in, p, s) == before:
                 low = middle
             else:
                 high = middle

@@ -6,7 +6,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from scanner_sim.crossings import distance, surface_normal, vector
 from scanner_sim.part import FlatPart
-from scanner_sim.raycast import side_of, solid_if, upload_program
+from scanner_sim.raycast import side_at, upload_program
 
 _STEPS = 4  # places that are tried between two points
 
@@ -116,25 +116,26 @@ def _onto(kind, data: ti.template(), s, p):
 def _walk(
     # In:
     code_in: I32Rows,
-    boxes_in: F64Rows,
+    first_in: I32Array,
+    grid_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
     index_in: I32Array,
-    first_in: F64Rows,
-    second_in: F64Rows,
+    starts_in: F64Rows,
+    ends_in: F64Rows,
     # Out:
     whole_out: I32Array,
 ):
     """Try places between two points of a face, until one is not on the part."""
     for i in range(index_in.shape[0]):
         s = index_in[i]
-        start, end = vector(first_in, i, 0), vector(second_in, i, 0)
+        start, end = vector(starts_in, i, 0), vector(ends_in, i, 0)
         whole = 1
         for k in range(_STEPS):
             if whole == 1:
                 p = start + (k + 1.0) / (_STEPS + 1.0) * (end - start)
                 p = _onto(kinds_in[s], data_in, s, p)
-                if side_of(solid_if(code_in, boxes_in, kinds_in, data_in, p, s)) == 0:
+                if side_at(code_in, first_in, grid_in, kinds_in, data_in, p, s) == 0:
                     whole = 0
         whole_out[i] = whole
 
@@ -143,7 +144,8 @@ def _walk(
 def _look_aside(
     # In:
     code_in: I32Rows,
-    boxes_in: F64Rows,
+    first_in: I32Array,
+    grid_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
     index_in: I32Array,
@@ -163,7 +165,7 @@ def _look_aside(
         for k in range(2):
             if side == 0:
                 there = _onto(kind, data_in, s, p + (2.0 * k - 1.0) * probe * across)
-                side = side_of(solid_if(code_in, boxes_in, kinds_in, data_in, there, s))
+                side = side_at(code_in, first_in, grid_in, kinds_in, data_in, there, s)
         sides_out[i] = side
 
 

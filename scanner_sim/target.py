@@ -126,7 +126,7 @@ class CsgTarget:
     ) -> np.ndarray:
         """Return whether something stands in the way of points of the solid."""
         lifted = positions + self.lift * normals
-        hits = cast(self.flat, lifted, directions, reach, any_hit=True, from_outside=True)
+        hits = cast(self.flat, lifted, directions, reach, from_outside=True)
         hidden: np.ndarray = hits.surface >= 0
         return hidden
 
