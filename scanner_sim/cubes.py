@@ -64,9 +64,9 @@ def divide(part: FlatPart) -> Cubes:
         length = runtime.download(lengths)[: len(parent)]
         used = np.arange(start[-1]) < np.repeat(start[:-1] + length, room)
         code = runtime.download(rows)[: start[-1]][used]
+        if len(code) == 0:
+            code = np.zeros((1, 3), np.int32)  # kernels take no empty arrays
         first = np.concatenate([[0], np.cumsum(length)]).astype(np.int32)
-    if len(code) == 0:
-        code = np.zeros((1, 3), np.int32)  # kernels take no empty arrays
     return Cubes(code, first, grid)
 
 
