@@ -51,7 +51,7 @@ _LEFT = 0.005
 # Surfaces that a set was taken apart into are real when they explain so much of it, and leave no
 # more than this many noises, fewer the less they explain: pieces of a free form are cut out as far
 # as they just fit, and leave gaps.
-_COVERED, _REAL, _REAL_FACE = 0.6, 1.15, 0.95
+_COVERED, _REAL = 0.6, 1.15
 
 
 class Tolerance(NamedTuple):
@@ -229,7 +229,7 @@ def explain(
     sets: list[np.ndarray],
     tolerance: Tolerance,
     *,
-    face: np.ndarray | None = None,
+    apart: bool = True,
 ) -> tuple[Surfaces, np.ndarray]:
     """Find the surfaces that explain sets of samples.
 
@@ -238,8 +238,7 @@ def explain(
         leaves: The leaves.
         sets: Samples that belong together, ascending, an array of indices for every set.
         tolerance: What counts as lying on a surface.
-        face: Sets that are one flat face already, shape (len(sets),), bool; None = no set. They
-            have to come apart more clearly than others.
+        apart: Take sets apart that no single surface explains.
 
     Returns:
         The surfaces, and the one that every sample lies on, -1 = none, shape (A,), i32.
@@ -257,10 +256,8 @@ def explain(
         weight = samples.weight[sets[s]]
         likely[s] = weight[there].sum() >= _WHOLE * weight.sum()
         sure[s] = likely[s] and rms <= _SURE * noise
-    limit = np.full(len(sets), _REAL) if face is None else np.where(face, _REAL_FACE, _REAL)
-    more, found = _take_apart(
-        samples, leaves, list(compress(sets, ~sure)), tolerance, limit[~sure] * noise
-    )
+    rest = list(compress(sets, ~sure)) if apart else []
+    more, found = _take_apart(samples, leaves, rest, tolerance)
     kept: list[int] = []
     for m, (s, there) in enumerate(zip(fitted, on, strict=True)):
         if likely[s] and not np.any(found[sets[s]] >= 0):
@@ -365,13 +362,9 @@ class _Set:
 
 
 def _take_apart(
-    samples: Samples,
-    leaves: Leaves,
-    sets: list[np.ndarray],
-    tolerance: Tolerance,
-    real: np.ndarray,
+    samples: Samples, leaves: Leaves, sets: list[np.ndarray], tolerance: Tolerance
 ) -> tuple[Surfaces, np.ndarray]:
-    """Find the surfaces of sets that no single one explains; they may leave so much [mm]."""
+    """Find the surfaces of sets that no single one explains."""
     label = np.full(len(samples), NONE, np.int32)
     found = no_surfaces()
     if not sets:
@@ -404,15 +397,15 @@ def _take_apart(
             w.on[:, ~w.free[w.scored]] = 0.0
             if w.weight[w.free].sum() < max(_LEFT * w.weight.sum(), tolerance.points):
                 active.remove(s)
-    return _real_ones(samples, sets, found, label, real)
+    return _real_ones(samples, sets, found, label, _REAL * noise)
 
 
 def _real_ones(
-    samples: Samples, sets: list[np.ndarray], found: Surfaces, label: np.ndarray, limit: np.ndarray
+    samples: Samples, sets: list[np.ndarray], found: Surfaces, label: np.ndarray, limit: float
 ) -> tuple[Surfaces, np.ndarray]:
     """Drop the surfaces of sets that are free forms."""
     real = np.zeros(len(found) + 1, bool)
-    for members, most in zip(sets, limit, strict=True):
+    for members in sets:
         name, weight = label[members], samples.weight[members]
         on = name >= 0
         covered = weight[on].sum() / weight.sum()
@@ -422,7 +415,7 @@ def _real_ones(
             samples.point[members[on]], name[on], found.kind, found.parameters
         )
         rms = np.sqrt(np.average(far**2, weights=weight[on]))
-        real[name[on]] = rms <= covered * most
+        real[name[on]] = rms <= covered * limit
     kept = np.flatnonzero(real[:-1])
     number = np.full(len(real), NONE, np.int32)
     number[kept] = np.arange(len(kept), dtype=np.int32)
