@@ -93,15 +93,14 @@ class _Search:
             self.grid, self.leaves, self.own, table, self.rule, passes=passes, closed=self.free
         )
 
-    def add(
-        self, samples: Samples, sets: list[np.ndarray], face: np.ndarray | None = None
-    ) -> bool:
+    def add(self, samples: Samples, sets: list[np.ndarray], *, apart: bool = True) -> bool:
         """Explain sets of samples; say whether that gave any new surface."""
-        new, label = explain(samples, self.leaves, sets, self.tolerance, face=face)
+        new, label = explain(samples, self.leaves, sets, self.tolerance, apart=apart)
         for members in sets:
             large = samples.weight[members].sum() >= _FREE * self.tolerance.points
-            if large and not np.any(label[members] >= 0):
-                self.free[samples.leaf[members]] = True
+            explained = np.any(label[members] >= 0)
+            if large or explained:
+                self.free[samples.leaf[members]] = not explained
         if len(new) == 0:
             return False
         base = len(self.surfaces)

@@ -10,19 +10,10 @@ from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.surfaces import KINDS, surface_at
 from octoseg_ti.stages.leaves import Samples
 from octoseg_ti.stages.primitives import FREEDOM, fit_all
+from octoseg_ti.stages.selection import choose
 from octoseg_ti.stages.starts import gather_moments
 from octoseg_ti.types import SurfaceKind
 
-# The simplest surface first.
-_SIMPLEST = (
-    SurfaceKind.PLANE,
-    SurfaceKind.SPHERE,
-    SurfaceKind.CYLINDER,
-    SurfaceKind.CONE,
-    SurfaceKind.TORUS,
-)
-# A simpler surface is taken when its residual is larger by no more than this.
-_SIMPLER = 1.1
 # A surface fits when its residual is below this many noises.
 _FIT = 1.5
 
@@ -137,25 +128,6 @@ def spread(members: np.ndarray, most: int) -> np.ndarray:
     return members[(2 * np.arange(most) + 1) * len(members) // (2 * most)]
 
 
-def simplest(rms: np.ndarray, noise: float) -> np.ndarray:
-    """Return the simplest kind whose residual is no worse than the best, or within the noise.
-
-    Args:
-        rms: Residual of every kind [mm], NaN = no such surface, shape (G, 5).
-        noise: Deviation of a point from its surface [mm].
-
-    Returns:
-        `SurfaceKind`, FREE_FORM where no kind fits, shape (G,), i32.
-    """
-    residual = np.where(np.isfinite(rms), rms, np.inf)
-    limit = np.maximum(_SIMPLER * residual.min(axis=1), noise)
-    limit = np.minimum(limit, _FIT * noise)
-    kind = np.full(len(rms), int(SurfaceKind.FREE_FORM), np.int32)
-    for k in reversed(_SIMPLEST):
-        kind[residual[:, k] <= limit] = int(k)
-    return kind
-
-
 def fit_sets(
     samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool = False
 ) -> tuple[np.ndarray, Surfaces]:
@@ -185,10 +157,9 @@ def fit_sets(
         fits = fit_all(
             samples.point[index], samples.normal[index], None, start, noise=noise, robust=robust
         )
-        chosen = simplest(fits.rms, noise)
-        kind[curved] = chosen
-        parameters[curved] = fits.parameters[np.arange(len(curved)), np.minimum(chosen, KINDS - 1)]
-    fitted = np.flatnonzero(kind < KINDS)
+        chosen = choose(fits, noise=noise, room=_FIT)
+        kind[curved], parameters[curved] = chosen.kind, chosen.parameters
+    fitted = np.flatnonzero((kind >= 0) & (kind < KINDS))
     return fitted, Surfaces(kind=kind[fitted], parameters=parameters[fitted])
 
 
