@@ -9,9 +9,9 @@ from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.surfaces import KINDS, surface_at
 from octoseg_ti.stages.leaves import Samples
-from octoseg_ti.stages.primitives import FREEDOM, fit_all
-from octoseg_ti.stages.selection import choose
-from octoseg_ti.stages.starts import gather_moments
+from octoseg_ti.stages.primitives import fit_all
+from octoseg_ti.stages.quadrics import fit_quadrics
+from octoseg_ti.stages.selection import choose, plane_does
 from octoseg_ti.types import SurfaceKind
 
 # A surface fits when its residual is below this many noises.
@@ -133,7 +133,7 @@ def fit_sets(
 ) -> tuple[np.ndarray, Surfaces]:
     """Fit the simplest surface to every set of samples.
 
-    Planes come first: a set that a plane leaves no more than the noise of is not fitted by others.
+    Planes come first: a set on which no curved surface could do better is fitted by no other.
 
     Args:
         samples: The samples.
@@ -149,8 +149,9 @@ def fit_sets(
     kind = np.full(len(sets), int(SurfaceKind.FREE_FORM), np.int32)
     parameters = np.full((len(sets), 8), np.nan)
     index, start = _in_a_row(sets)
-    rms, parameters[:, :6] = _planes(samples.point[index], samples.normal[index], start)
-    kind[rms <= noise] = int(SurfaceKind.PLANE)
+    flat = fit_quadrics(samples.point[index], samples.normal[index], start)
+    kind[plane_does(flat, np.diff(start), noise=noise, room=_FIT)] = int(SurfaceKind.PLANE)
+    parameters[:, :6] = np.column_stack([flat.centre, flat.normal])
     curved = np.flatnonzero(kind >= KINDS)
     if len(curved):
         index, start = _in_a_row([sets[s] for s in curved])
@@ -166,14 +167,3 @@ def fit_sets(
 def _in_a_row(sets: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return sets one after the other, and where each begins, with the end."""
     return np.concatenate(sets), np.cumsum([0] + [len(s) for s in sets]).astype(np.int32)
-
-
-def _planes(
-    point: np.ndarray, normal: np.ndarray, start: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the residual [mm] of the plane through every group, NaN = too few points; and it."""
-    m = gather_moments(point, normal, np.ones(len(point)), start)
-    value, vector = np.linalg.eigh(np.nan_to_num(m.qq))
-    rms = np.sqrt(np.maximum(value[:, 0], 0.0)) * m.extent
-    few = np.diff(start) <= FREEDOM[int(SurfaceKind.PLANE)]
-    return np.where(few, np.nan, rms), np.column_stack([m.centre, vector[:, :, 0]])
