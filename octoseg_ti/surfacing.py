@@ -16,15 +16,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.params import Params
 from octoseg_ti.patches import Regions
-from octoseg_ti.stages.extraction import (
-    Surfaces,
-    Tolerance,
-    explain,
-    fit_sets,
-    lie_on,
-    no_surfaces,
-    spread,
-)
+from octoseg_ti.stages.extraction import Tolerance, explain
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import (
     Choice,
@@ -43,6 +35,7 @@ from octoseg_ti.stages.merging import (
     merge_surfaces,
     pieces,
 )
+from octoseg_ti.stages.sets import Surfaces, fit_sets, lie_on, no_surfaces, spread
 from octoseg_ti.types import NONE
 
 _ROUNDS = 2

@@ -5,24 +5,17 @@ neighbourhoods of many samples are candidates; the one that explains most of wha
 long as fitting it anew lets it explain more (Besl and Jain 1988), and takes what it explains.
 """
 
-from dataclasses import dataclass
 from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
 
-from octoseg_ti.device import runtime
-from octoseg_ti.device.linalg import row, vec3
-from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
-from octoseg_ti.device.surfaces import KINDS, evaluate_surfaces, surface_at
+from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.stages.leaves import Leaves, Samples
-from octoseg_ti.stages.primitives import Fits, fit_all
-from octoseg_ti.stages.selection import choose
+from octoseg_ti.stages.sets import Surfaces, fit_sets, lie_on, no_surfaces, spread
 from octoseg_ti.types import NONE
 
-# A surface fits when its residual is below this many noises.
-_FIT = 1.5
 # A sample lies on a surface within this many noises.
 _ON = 3.0
 # A surface explains a set when this share of it lies on it.
@@ -39,6 +32,9 @@ _SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS = 40, 8, 200
 # A surface grows until it gains less than this, at most so often.
 _GAIN, _GROWTHS = 1.02, 4
 _LEFT = 0.005
+# Candidates that explain this share of what the best one does grow together with it, and are
+# taken together when so much of them is left by the larger ones.
+_TOGETHER, _KEPT = 0.25, 0.8
 # Surfaces that a set was taken apart into are real when they explain so much of it, and leave no
 # more than so many noises, fewer the less they explain and the more of it neighbours share: pieces
 # of a free form are cut out as far as they just fit, and leave gaps and waves.
@@ -54,147 +50,6 @@ class Tolerance(NamedTuple):
     """Largest angle between the normals of a sample and of its surface [rad]."""
     points: float
     """Fewest points of a surface."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Surfaces:
-    """Analytic surfaces, ``M`` of them."""
-
-    kind: np.ndarray
-    """`SurfaceKind`, shape (M,), i32."""
-    parameters: np.ndarray
-    """As in `Segmentation.parameters`, but relative to the corner of the grid, shape (M, 8)."""
-
-    def __len__(self) -> int:
-        """Return the number of surfaces."""
-        return len(self.kind)
-
-    def joined(self, other: "Surfaces") -> "Surfaces":
-        """Return these and other surfaces."""
-        return Surfaces(
-            kind=np.concatenate([self.kind, other.kind]),
-            parameters=np.concatenate([self.parameters, other.parameters]),
-        )
-
-    def at(self, which: np.ndarray) -> "Surfaces":
-        """Return some of the surfaces."""
-        return Surfaces(kind=self.kind[which], parameters=self.parameters[which])
-
-
-def no_surfaces() -> Surfaces:
-    """Return no surface."""
-    return Surfaces(kind=np.zeros(0, np.int32), parameters=np.zeros((0, 8)))
-
-
-@ti.kernel
-def _lie_on(
-    limit: ti.f64,
-    cosine: ti.f64,
-    # In:
-    point_in: F64Rows,
-    normal_in: F64Rows,
-    sample_in: I32Array,
-    surface_in: F64Rows,
-    range_in: I32Rows,
-    # Out:
-    on_out: I32Array,
-):
-    """Say for every surface which samples of its range lie on it."""
-    for s in range(range_in.shape[0]):
-        kind = ti.cast(surface_in[s, 8], ti.i32)
-        origin = row(surface_in, s)
-        axis = vec3(surface_in[s, 3], surface_in[s, 4], surface_in[s, 5])
-        for j in range(range_in[s, 0], range_in[s, 1]):
-            i = sample_in[j]
-            d, n = surface_at(
-                kind, row(point_in, i), origin, axis, surface_in[s, 6], surface_in[s, 7]
-            )
-            m = row(normal_in, i)
-            on = ti.cast(ti.abs(d) <= limit, ti.i32)
-            if ti.abs(n.dot(m)) < cosine and m.norm_sqr() > 0.0:
-                on = 0
-            on_out[range_in[s, 2] + j - range_in[s, 0]] = on
-
-
-def lie_on(
-    samples: Samples,
-    sets: list[np.ndarray],
-    which: np.ndarray,
-    surfaces: Surfaces,
-    limit: float,
-    turn: float,
-) -> list[np.ndarray]:
-    """Return for every surface which samples of a set lie on it.
-
-    Args:
-        samples: The samples.
-        sets: Sets of samples.
-        which: The set that every surface is compared with, shape (M,).
-        surfaces: The surfaces.
-        limit: Largest distance [mm].
-        turn: Largest angle between the normals [rad].
-
-    Returns:
-        Whether each sample of the set lies on the surface, an array of bool for every surface.
-    """
-    runtime.ensure_started()
-    if len(surfaces) == 0:
-        return []
-    length = np.array([len(s) for s in sets], np.int64)
-    begin = np.cumsum(length) - length
-    out = np.cumsum(length[which]) - length[which]
-    ranges = np.stack([begin[which], begin[which] + length[which], out], axis=1).astype(np.int32)
-    on = runtime.empty(int(length[which].sum()), np.int32)
-    _lie_on(
-        limit,
-        float(np.cos(min(turn, np.pi / 2))),
-        runtime.upload(samples.point),
-        runtime.upload(samples.normal),
-        runtime.upload(np.concatenate(sets).astype(np.int32)),
-        runtime.upload(np.column_stack([surfaces.parameters, surfaces.kind])),
-        runtime.upload(ranges),
-        on,
-    )
-    found = runtime.download(on).astype(bool)
-    return [found[o : o + n] for o, n in zip(out, length[which], strict=True)]
-
-
-def spread(members: np.ndarray, most: int) -> np.ndarray:
-    """Return at most so many members, evenly spaced."""
-    if len(members) <= most:
-        return members
-    return members[(2 * np.arange(most) + 1) * len(members) // (2 * most)]
-
-
-def fit_sets(
-    samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool = False
-) -> tuple[np.ndarray, Surfaces]:
-    """Fit the simplest surface to every set of samples.
-
-    Returns:
-        Which sets have one, indices, shape (M,), and these surfaces.
-    """
-    if not sets:
-        return np.zeros(0, np.int64), no_surfaces()
-    return _simplest_of(_fit(samples, sets, noise, robust=robust), noise)
-
-
-def _fit(samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool = False) -> Fits:
-    """Fit all kinds of surfaces to every set of samples."""
-    start = np.cumsum([0] + [len(s) for s in sets])
-    index = np.concatenate(sets)
-    return fit_all(
-        samples.point[index], samples.normal[index], None, start, noise=noise, robust=robust
-    )
-
-
-def _simplest_of(fits: Fits, noise: float) -> tuple[np.ndarray, Surfaces]:
-    """Return which fits give a surface, and the simplest of each."""
-    chosen = choose(fits, noise=noise, room=_FIT)
-    fitted = np.flatnonzero((chosen.kind >= 0) & (chosen.kind < KINDS))
-    return fitted, Surfaces(
-        kind=chosen.kind[fitted].astype(np.int32), parameters=chosen.parameters[fitted]
-    )
 
 
 def explain(
@@ -221,8 +76,7 @@ def explain(
     noise = tolerance.noise
     if not sets:
         return no_surfaces(), label
-    fits = _fit(samples, [spread(s, _MANY) for s in sets], noise, robust=True)
-    fitted, whole = _simplest_of(fits, noise)
+    fitted, whole = fit_sets(samples, [spread(s, _MANY) for s in sets], noise, robust=True)
     turn = max(tolerance.turn, 0.5)
     on = lie_on(samples, sets, fitted, whole, (_ON + 0.5) * noise, turn)
     likely, sure = np.zeros(len(sets), bool), np.zeros(len(sets), bool)
@@ -322,17 +176,31 @@ class _Set:
         size = np.bincount(part[part >= 0], weights=self.weight[part >= 0])
         return part == int(np.argmax(size))
 
-    def best(self, least: float) -> tuple[int, np.ndarray] | None:
-        """Return the candidate that explains most of what is left, and what it explains."""
+    def best(self, least: float) -> list[int]:
+        """Return the candidates that explain most of what is left, each without the others."""
         weight = (self.weight * self.free)[self.scored].astype(np.float32)
         weight *= np.float32(self.weight.sum() / max(self.weight[self.scored].sum(), 1e-300))
-        support = np.einsum("cs,s->c", self.on, weight)  # no BLAS: its sums depend on threads
-        if len(support) == 0:
-            return None
-        c = int(np.argmax(support))
-        if support[c] < least:
-            return None
-        return c, self.on[c] > 0
+        chosen: list[int] = []
+        while len(self.on):
+            support = np.einsum("cs,s->c", self.on, weight)  # no BLAS: its sums depend on threads
+            c = int(np.argmax(support))
+            if support[c] < least:
+                break
+            if not chosen:
+                least = max(least, _TOGETHER * float(support[c]))
+            chosen.append(c)
+            weight = weight * (1.0 - self.on[c])
+        return chosen
+
+    def take(self, part: np.ndarray) -> None:
+        """Take away what a surface explains."""
+        self.free &= ~part
+        self.on[:, ~self.free[self.scored]] = 0.0
+
+    def used_up(self, least: float) -> bool:
+        """Return whether too little is left for another surface."""
+        left = self.weight[self.free].sum()
+        return bool(left < max(_LEFT * self.weight.sum(), least))
 
 
 def _take_apart(
@@ -352,25 +220,24 @@ def _take_apart(
         mine = np.flatnonzero(owner == s)
         w.surfaces = surfaces.at(mine)
         w.on = np.array([on[c] for c in mine], np.float32).reshape(len(mine), len(w.scored))
-    active = list(range(len(sets)))
+    active = work
     while active:
-        chosen = {s: work[s].best(tolerance.points) for s in active}
-        active = [s for s in active if chosen[s] is not None]
-        if not active:
-            break
-        start = [work[s].surfaces.at(np.array([chosen[s][0]])) for s in active]  # type: ignore[index]
-        grown = _grow(samples, [work[s] for s in active], start, tolerance)
-        for s, (surface, part) in zip(list(active), grown, strict=True):
-            w = work[s]
-            if w.weight[part].sum() < tolerance.points:
-                w.on[chosen[s][0]] = 0.0  # type: ignore[index]
+        wave = [(w, c) for w in active for c in w.best(tolerance.points)]
+        start = [w.surfaces.at(np.array([c])) for w, c in wave]
+        grown = _grow(samples, [w for w, _ in wave], start, tolerance)
+        size = np.array([w.weight[g[1]].sum() for (w, _), g in zip(wave, grown, strict=True)])
+        for k in np.argsort(-size, kind="stable"):
+            (w, c), (surface, part) = wave[k], grown[k]
+            left = part & w.free
+            if w.weight[left].sum() < _KEPT * size[k]:
+                continue  # what a larger one has taken is no longer in its way
+            if w.weight[left].sum() < tolerance.points:
+                w.on[c] = 0.0
                 continue
-            label[w.members[part]] = len(found)
+            label[w.members[left]] = len(found)
             found = found.joined(surface)
-            w.free &= ~part
-            w.on[:, ~w.free[w.scored]] = 0.0
-            if w.weight[w.free].sum() < max(_LEFT * w.weight.sum(), tolerance.points):
-                active.remove(s)
+            w.take(left)
+        active = [w for w in dict.fromkeys(w for w, _ in wave) if not w.used_up(tolerance.points)]
     return _real_ones(samples, sets, found, label, _REAL * noise)
 
 
