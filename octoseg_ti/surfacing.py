@@ -50,6 +50,8 @@ _INNER = 40
 # A surface is given up when its neighbours explain its points with this mean square, in noises.
 _EXPLAINED = 2.0
 _MERGES = 3
+# By how much the cost of a surface found late must be lower, in squares of noises.
+_HANDICAP = 2.0
 # A free form has at least this many times the points of the smallest patch.
 _FREE = 10.0
 # A point that fits nothing joins a patch within so many times the usual reach.
@@ -77,6 +79,8 @@ class _Search:
         self.surfaces = no_surfaces()
         self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
         self.choice: Choice | None = None
+        # Surfaces found in what others left have to be clearly better where others fit.
+        self.early = 0
         # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut out
         # of a group, is no group of its own.
         self.free = np.zeros(len(leaves), bool)
@@ -90,9 +94,8 @@ class _Search:
 
     def choose(self, passes: int = 1) -> None:
         """Let the points choose among the surfaces that have points near them."""
-        table = surface_table(
-            self.surfaces.kind, self.surfaces.parameters, np.zeros(len(self.surfaces))
-        )
+        late = np.arange(len(self.surfaces)) >= self.early
+        table = surface_table(self.surfaces.kind, self.surfaces.parameters, _HANDICAP * late)
         self.choice, self.own = label_points(
             self.grid, self.leaves, self.own, table, self.rule, passes=passes, closed=self.free
         )
@@ -231,6 +234,7 @@ def find_surfaces(
         inside = np.where(search.free, cut, NONE)
         faces = _sets_of(samples, leaves, inside, tolerance.points)
         search.add(samples, faces, apart=False)
+    search.early = len(search.surfaces)
     for _ in range(_ROUNDS):
         search.choose(passes=2)
         search.refit()
@@ -244,6 +248,8 @@ def find_surfaces(
         merged = search.merge()
         if not search.give_up() and not merged:
             break
+    search.early = len(search.surfaces)
+    search.choose()
     return Surfaced(surfaces=search.surfaces, label=search.label, own=search.own)
 
 
@@ -291,7 +297,6 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         table = surface_table(
             surfaced.surfaces.kind[surface],
             surfaced.surfaces.parameters[surface],
-            np.zeros(len(surface)),
         )
         loose = rule._replace(reach=_LOOSE * rule.reach, turn=float(np.pi))
         own = label_lists(graph, np.where(label < len(surface), label, NONE))
