@@ -29,7 +29,7 @@ _NEAR = (20, 60, 150)
 # Samples of a set that tell how much a candidate explains.
 _SCORED = 3000
 # Seeds of a set, and into how many looks they are divided: each looks at what is left.
-_SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS, _LOOKS = 40, 8, 200, 4
+_SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS, _LOOKS = 40, 8, 200, 2
 # A surface grows until it gains less than this, at most so often.
 _GAIN, _GROWTHS = 1.02, 4
 _LEFT = 0.005
