@@ -45,6 +45,8 @@ _SAMPLES, _REST = 4, 6
 _LEFT_POINTS = 2
 # Samples for fitting a surface anew.
 _REFIT = 300
+# ... away from other surfaces, if there are so many of these.
+_INNER = 40
 # A surface is given up when its neighbours explain its points with this mean square, in noises.
 _EXPLAINED = 2.0
 _MERGES = 3
@@ -75,8 +77,10 @@ class _Search:
         self.surfaces = no_surfaces()
         self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
         self.choice: Choice | None = None
-        # Leaves of free forms choose nothing, and what fits nothing there is no group of its own.
+        # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut out
+        # of a group, is no group of its own.
         self.free = np.zeros(len(leaves), bool)
+        self.face = np.zeros(len(leaves), bool)
 
     @property
     def label(self) -> np.ndarray:
@@ -101,6 +105,7 @@ class _Search:
             explained = np.any(label[members] >= 0)
             if large or explained:
                 self.free[samples.leaf[members]] = not explained
+                self.face[samples.leaf[members]] |= not apart
         if len(new) == 0:
             return False
         base = len(self.surfaces)
@@ -118,6 +123,14 @@ class _Search:
         """Fit the surfaces anew to the samples that chose them."""
         label = self.label[self.samples.index]
         members = members_of(label, len(self.surfaces))
+        # Points beside other surfaces may belong to these: where there are enough, others count.
+        inner = members_of(
+            np.where(self.inner()[self.samples.leaf], label, NONE), len(self.surfaces)
+        )
+        members = [
+            i if len(i) >= _INNER and 4 * len(i) >= len(m) else m
+            for i, m in zip(inner, members, strict=True)
+        ]
         which = np.array([m for m, s in enumerate(members) if len(s) >= 10], np.int64)
         sets = [spread(members[m], _REFIT) for m in which]
         noise = self.tolerance.noise
@@ -130,6 +143,15 @@ class _Search:
                 kind[which[f]], parameters[which[f]] = fits.kind[k], fits.parameters[k]
         self.surfaces = Surfaces(kind=kind, parameters=parameters)
 
+    def inner(self) -> np.ndarray:
+        """Return which leaves are full of one surface, as are all that touch them; (C,), bool."""
+        common = common_label(self.leaves, self.label)
+        border = common[self.leaves.a] != common[self.leaves.b]
+        inner = common >= 0
+        inner[self.leaves.a[border]] = False
+        inner[self.leaves.b[border]] = False
+        return inner
+
     def rename(self, name: np.ndarray) -> None:
         """Give surfaces other numbers; -1 gives them up."""
         there = self.own >= 0
@@ -140,7 +162,7 @@ class _Search:
         """Return samples of the points that fit nothing, in connected sets."""
         label, leaves = self.label, self.leaves
         left = np.add.reduceat((label < 0).astype(np.int32), leaves.first)
-        there = (left >= _LEFT_POINTS) & ~self.free
+        there = (left >= _LEFT_POINTS) & ~self.free & ~self.face
         both = there[leaves.a] & there[leaves.b]
         root = components(len(leaves), leaves.a[both], leaves.b[both])
         size = np.bincount(root[there], left[there], minlength=len(leaves))

@@ -37,9 +37,9 @@ _LEFT = 0.005
 # taken together when so much of them is left by the larger ones.
 _TOGETHER, _KEPT = 0.25, 0.8
 # Surfaces that a set was taken apart into are real when they explain so much of it, and leave no
-# more than this many noises, fewer the less they explain: pieces of a free form are cut out as far
-# as they just fit, and leave gaps.
-_COVERED, _REAL = 0.6, 1.15
+# more than so many noises, fewer the less they explain and the more of it neighbours share: pieces
+# of a free form are cut out as far as they just fit, and leave gaps and waves.
+_COVERED, _REAL = 0.6, 1.75
 
 
 class Tolerance(NamedTuple):
@@ -261,7 +261,10 @@ def _real_ones(
             samples.point[members[on]], name[on], found.kind, found.parameters
         )
         rms = np.sqrt(np.average(far**2, weights=weight[on]))
-        real[name[on]] = rms <= covered * limit
+        pair = name[on][1:] == name[on][:-1]
+        product, square = far[1:][pair] * far[:-1][pair], far[1:][pair] ** 2
+        shared = max(0.0, float(product.sum()) / max(float(square.sum()), 1e-300))
+        real[name[on]] = (1.0 + shared) * rms <= covered * limit
     kept = np.flatnonzero(real[:-1])
     number = np.full(len(real), NONE, np.int32)
     number[kept] = np.arange(len(kept), dtype=np.int32)

@@ -28,9 +28,9 @@ class Rule(NamedTuple):
     """Deviation of a point from its surface [mm]."""
     tilt: float
     """Deviation of its normal [rad]."""
-    reach: float = 4.0
+    reach: float = 2.5
     """Farthest point of a surface, in noises."""
-    turn: float = 1.0
+    turn: float = 0.4
     """Largest angle between the normals of a point and of its surface [rad]."""
 
 

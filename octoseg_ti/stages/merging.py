@@ -23,7 +23,7 @@ _FEW = 10
 _UNIT = 1024.0
 # What deviates by no more than this many noises and tilts, and is no larger than this share of the
 # surface beside it, is an error of its form.
-_FORM, _SMOOTH, _SMALL = 4.0, 3.0, 0.15
+_FORM, _SMOOTH, _SMALL = 4.0, 3.0, 0.25
 
 
 def contacts(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,8 +3,8 @@
 Second differences along a stripe see what two neighbours do not share. What decides whether a point
 lies on a surface is more than that: steps of the range, speckle over several points, views that do
 not quite meet. It is measured where it matters, as the residual of the best analytic surface
-through neighbourhoods of about a hundred points, taken at the calmest quarter of them. A quadric
-does for most of them; where it bends too much, surfaces are fitted.
+through neighbourhoods of about a hundred points: of half of them, for edges run through the others.
+A quadric does for most of them; where it bends too much, surfaces are fitted.
 """
 
 import numpy as np
@@ -17,7 +17,8 @@ from octoseg_ti.stages.quadrics import QUADRIC_FREEDOM, fit_quadrics
 # Neighbourhoods, and the points of each.
 _COUNT, _POINTS = 256, 128
 _FEWEST = 24
-_CALM = 0.25
+# The median counts, up to so many times the lower quartile: edges may run through most.
+_CALM, _MIDDLE, _EDGES = 0.25, 0.5, 1.5
 # A quadric is no surface any more where it turns by so much from the middle to the rim [rad].
 _BEND = 0.35
 # Where it leaves so many times what it leaves of the calm ones, there is an edge.
@@ -47,7 +48,9 @@ def surface_noise(grid: Grid) -> float:
     # In an order that has nothing to do with that of the input.
     order = np.lexsort((*point.T, np.repeat(np.arange(len(first)), count)))
     point, normal = point[order], runtime.download(grid.normal)[index[order]]
-    return float(np.quantile(_residuals(point, normal, np.concatenate([[0], ends])), _CALM))
+    rms = _residuals(point, normal, np.concatenate([[0], ends]))
+    calm, middle = np.quantile(rms, [_CALM, _MIDDLE])
+    return float(min(middle, _EDGES * calm))
 
 
 def _residuals(point: np.ndarray, normal: np.ndarray, start: np.ndarray) -> np.ndarray:

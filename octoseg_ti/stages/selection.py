@@ -12,7 +12,7 @@ from octoseg_ti.types import SurfaceKind
 # A parameter more has to gain this many times log(n) in log-likelihood (times 2). BIC asks for 1
 # and takes the noise of points for independent; three times that holds where stripes or views share
 # some of it, and is four standard deviations for a hundred points.
-_PENALTY = 3.0
+_PENALTY = 8.0
 _COUNTED = 500  # points beyond these prove nothing more: then it is form, no noise, that is seen
 _FORM = 0.1  # deviations of form, in noise, that no kind has to explain
 _ROUNDING = 1e-5  # ... and in extents, for data without noise
