@@ -13,7 +13,7 @@ import numpy as np
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.stages.leaves import Leaves, Samples
-from octoseg_ti.stages.sets import Surfaces, fit_sets, lie_on, no_surfaces, spread
+from octoseg_ti.stages.sets import Surfaces, fit_sets, joined, lie_on, no_surfaces, spread
 from octoseg_ti.types import NONE
 
 # A sample lies on a surface within this many noises.
@@ -28,7 +28,8 @@ _MANY, _SOME = 200, 150
 _NEAR = (20, 60, 150)
 # Samples of a set that tell how much a candidate explains.
 _SCORED = 3000
-_SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS = 40, 8, 200
+# Seeds of a set, and into how many looks they are divided: each looks at what is left.
+_SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS, _LOOKS = 40, 8, 200, 2
 # A surface grows until it gains less than this, at most so often.
 _GAIN, _GROWTHS = 1.02, 4
 _LEFT = 0.005
@@ -126,25 +127,6 @@ def _neighborhoods(point: np.ndarray, seeds: np.ndarray, count: int) -> np.ndarr
     return np.sort(near, axis=1)
 
 
-def _candidates(
-    samples: Samples, sets: list[np.ndarray], noise: float
-) -> tuple[Surfaces, np.ndarray]:
-    """Return surfaces through neighbourhoods of seeds, and the set of each."""
-    groups, owner = [], []
-    for s, members in enumerate(sets):
-        most = int(np.clip(len(members) // _SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS))
-        seeds = spread(np.arange(len(members)), most)
-        place = samples.point[members]
-        for count in _NEAR:
-            near = _neighborhoods(place, seeds, min(count, len(members)))
-            groups += list(members[near])
-            owner += [s] * len(near)
-            if count >= len(members):
-                break
-    fitted, surfaces = fit_sets(samples, groups, noise)
-    return surfaces, np.array(owner, np.int64)[fitted]
-
-
 class _Set:
     """A set that is taken apart: what is left of it, and its candidates."""
 
@@ -159,9 +141,23 @@ class _Set:
         both = (a >= 0) & (b >= 0)
         self.a, self.b = a[both], b[both]
         self.total = np.bincount(self.place, minlength=len(self.leaf))
-        self.scored = spread(np.arange(len(members)), _SCORED)
-        self.on = np.zeros((0, len(self.scored)), np.float32)
+        self.seeds = int(np.clip(len(members) // _SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS))
+        self.each = max(self.seeds // _LOOKS, _LEAST_SEEDS)
+        self.scored = np.zeros(0, np.int64)
+        self.on = np.zeros((0, 0), np.float32)
         self.surfaces = no_surfaces()
+
+    def neighborhoods(self, point: np.ndarray) -> list[np.ndarray]:
+        """Return samples around some that are left, in several sizes."""
+        left = self.members[self.free]
+        seeds = spread(np.arange(len(left)), min(self.each, self.seeds))
+        self.seeds -= self.each
+        near: list[np.ndarray] = []
+        for count in _NEAR:
+            near += list(left[_neighborhoods(point[left], seeds, min(count, len(left)))])
+            if count >= len(left):
+                break
+        return near
 
     def connected(self, on: np.ndarray) -> np.ndarray:
         """Return the largest connected part of some members, bool."""
@@ -178,8 +174,9 @@ class _Set:
 
     def best(self, least: float) -> list[int]:
         """Return the candidates that explain most of what is left, each without the others."""
-        weight = (self.weight * self.free)[self.scored].astype(np.float32)
-        weight *= np.float32(self.weight.sum() / max(self.weight[self.scored].sum(), 1e-300))
+        weight = (self.weight * self.free)[self.scored]
+        share = self.weight[self.free].sum() / max(weight.sum(), 1e-300)
+        weight = (share * weight).astype(np.float32)
         chosen: list[int] = []
         while len(self.on):
             support = np.einsum("cs,s->c", self.on, weight)  # no BLAS: its sums depend on threads
@@ -189,7 +186,7 @@ class _Set:
             if not chosen:
                 least = max(least, _TOGETHER * float(support[c]))
             chosen.append(c)
-            weight = weight * (1.0 - self.on[c])
+            weight *= 1.0 - self.on[c]
         return chosen
 
     def take(self, part: np.ndarray) -> None:
@@ -197,10 +194,27 @@ class _Set:
         self.free &= ~part
         self.on[:, ~self.free[self.scored]] = 0.0
 
-    def used_up(self, least: float) -> bool:
+    def ended(self, least: float) -> bool:
         """Return whether too little is left for another surface."""
         left = self.weight[self.free].sum()
         return bool(left < max(_LEFT * self.weight.sum(), least))
+
+
+def _find_candidates(samples: Samples, work: list[_Set], tolerance: Tolerance) -> None:
+    """Give sets the surfaces through neighbourhoods of what is left of them for candidates."""
+    groups = [w.neighborhoods(samples.point) for w in work]
+    owner = np.repeat(np.arange(len(work)), [len(g) for g in groups])
+    fitted, surfaces = fit_sets(samples, [near for g in groups for near in g], tolerance.noise)
+    owner = owner[fitted]
+    for w in work:
+        w.scored = spread(np.flatnonzero(w.free), _SCORED)
+    scored = [w.members[w.scored] for w in work]
+    limit = _ON * tolerance.noise
+    on = lie_on(samples, scored, owner, surfaces, limit, tolerance.turn)
+    for s, w in enumerate(work):
+        mine = np.flatnonzero(owner == s)
+        w.surfaces = surfaces.at(mine)
+        w.on = np.array([on[c] for c in mine], np.float32).reshape(len(mine), len(w.scored))
 
 
 def _take_apart(
@@ -209,36 +223,27 @@ def _take_apart(
     """Find the surfaces of sets that no single one explains."""
     label = np.full(len(samples), NONE, np.int32)
     found = no_surfaces()
-    if not sets:
-        return found, label
-    noise, limit = tolerance.noise, _ON * tolerance.noise
-    surfaces, owner = _candidates(samples, sets, noise)
-    work = [_Set(samples, leaves, members) for members in sets]
-    scored = [w.members[w.scored] for w in work]
-    on = lie_on(samples, scored, owner, surfaces, limit, tolerance.turn)
-    for s, w in enumerate(work):
-        mine = np.flatnonzero(owner == s)
-        w.surfaces = surfaces.at(mine)
-        w.on = np.array([on[c] for c in mine], np.float32).reshape(len(mine), len(w.scored))
-    active = work
+    active = [_Set(samples, leaves, members) for members in sets]
     while active:
-        wave = [(w, c) for w in active for c in w.best(tolerance.points)]
-        start = [w.surfaces.at(np.array([c])) for w, c in wave]
-        grown = _grow(samples, [w for w, _ in wave], start, tolerance)
-        size = np.array([w.weight[g[1]].sum() for (w, _), g in zip(wave, grown, strict=True)])
-        for k in np.argsort(-size, kind="stable"):
-            (w, c), (surface, part) = wave[k], grown[k]
-            left = part & w.free
-            if w.weight[left].sum() < _KEPT * size[k]:
-                continue  # what a larger one has taken is no longer in its way
-            if w.weight[left].sum() < tolerance.points:
-                w.on[c] = 0.0
-                continue
-            label[w.members[left]] = len(found)
-            found = found.joined(surface)
-            w.take(left)
-        active = [w for w in dict.fromkeys(w for w, _ in wave) if not w.used_up(tolerance.points)]
-    return _real_ones(samples, sets, found, label, _REAL * noise)
+        _find_candidates(samples, active, tolerance)
+        gained: dict[_Set, None] = {}
+        going = active
+        while going:
+            wave = [(w, c) for w in going for c in w.best(tolerance.points)]
+            start = [w.surfaces.at(np.array([c])) for w, c in wave]
+            taken: dict[_Set, None] = {}
+            for k, surface, part in _grow(samples, [w for w, _ in wave], start, tolerance):
+                w, size = wave[k][0], wave[k][0].weight[part].sum()
+                left = part & w.free
+                if w.weight[left].sum() >= max(_KEPT * size, tolerance.points):
+                    label[w.members[left]] = len(found)
+                    found = found.joined(surface)
+                    w.take(left)
+                    taken[w] = None
+            going = [w for w in taken if not w.ended(tolerance.points)]
+            gained |= taken
+        active = [w for w in gained if w.seeds > 0 and not w.ended(tolerance.points)]
+    return _real_ones(samples, sets, found, label, _REAL * tolerance.noise)
 
 
 def _real_ones(
@@ -268,36 +273,37 @@ def _real_ones(
 
 def _grow(
     samples: Samples, work: list[_Set], start: list[Surfaces], tolerance: Tolerance
-) -> list[tuple[Surfaces, np.ndarray]]:
-    """Grow a surface in every set while fitting it anew lets it explain more."""
+) -> list[tuple[int, Surfaces, np.ndarray]]:
+    """Grow surfaces in their sets while fitting them anew lets them explain more.
 
-    def explained(which: list[int], surfaces: list[Surfaces]) -> list[np.ndarray]:
-        members = [work[i].members for i in which]
-        all_surfaces = no_surfaces()
-        for one in surfaces:
-            all_surfaces = all_surfaces.joined(one)
+    Returns:
+        Number, surface and what it explains, of those that explain enough; the largest first.
+    """
+
+    def explained(which: list[int], surfaces: Surfaces) -> list[np.ndarray]:
+        sets = list(dict.fromkeys(work[i] for i in which))
+        place = {w: s for s, w in enumerate(sets)}
         on = lie_on(
-            samples, members, np.arange(len(which)), all_surfaces, _ON * tolerance.noise,
-            tolerance.turn,
+            samples, [w.members for w in sets], np.array([place[work[i]] for i in which], np.int64),
+            surfaces, _ON * tolerance.noise, tolerance.turn,
         )  # fmt: skip
         return [work[i].connected(o & work[i].free) for i, o in zip(which, on, strict=True)]
 
-    surface = list(start)
-    part = explained(list(range(len(work))), surface)
-    growing = [i for i, p in enumerate(part) if p.any()]
+    surface, part = list(start), explained(list(range(len(work))), joined(start))
+    size = [w.weight[p].sum() for w, p in zip(work, part, strict=True)]
+    growing = [i for i in range(len(work)) if size[i] >= tolerance.points]
     for _ in range(_GROWTHS):
         if not growing:
             break
         groups = [spread(work[i].members[part[i]], _SOME) for i in growing]
         fitted, fits = fit_sets(samples, groups, tolerance.noise, robust=True)
         which = [growing[f] for f in fitted]
-        wider = explained(which, [fits.at(np.array([k])) for k in range(len(fitted))])
         growing = []
-        for k, i in enumerate(which):
-            before = work[i].weight[part[i]].sum()
-            after = work[i].weight[wider[k]].sum()
+        for k, (i, wider) in enumerate(zip(which, explained(which, fits), strict=True)):
+            before, after = size[i], work[i].weight[wider].sum()
             if after >= 0.9 * before:
-                surface[i], part[i] = fits.at(np.array([k])), wider[k]
+                surface[i], part[i], size[i] = fits.at(np.array([k])), wider, after
                 if after > _GAIN * before:
                     growing.append(i)
-    return list(zip(surface, part, strict=True))
+    order = np.argsort([-s for s in size], kind="stable")
+    return [(int(i), surface[i], part[i]) for i in order if size[i] >= tolerance.points]

@@ -6,8 +6,8 @@ import numpy as np
 
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
-from octoseg_ti.stages.sets import Surfaces, fit_sets, spread
 from octoseg_ti.stages.leaves import Leaves, Samples
+from octoseg_ti.stages.sets import Surfaces, fit_sets, spread
 from octoseg_ti.types import NONE
 
 # Samples of each surface in a common fit.

@@ -104,7 +104,7 @@ def choose(
 def plane_does(
     flat: Quadrics, count: np.ndarray, *, noise: float, room: float = _ROOM
 ) -> np.ndarray:
-    """Say which groups `choose` would take for planes, whatever curved surfaces were fitted to them.
+    """Say which groups `choose` would take for planes, whatever else were fitted to them.
 
     Args:
         flat: Planes and quadrics through the groups; the quadrics stand for all curved surfaces.

@@ -48,6 +48,15 @@ def no_surfaces() -> Surfaces:
     return Surfaces(kind=np.zeros(0, np.int32), parameters=np.zeros((0, 8)))
 
 
+def joined(surfaces: list[Surfaces]) -> Surfaces:
+    """Return surfaces in one list."""
+    whole = [no_surfaces(), *surfaces]
+    return Surfaces(
+        kind=np.concatenate([s.kind for s in whole]),
+        parameters=np.concatenate([s.parameters for s in whole]),
+    )
+
+
 @ti.kernel
 def _lie_on(
     limit: ti.f64,
