@@ -43,9 +43,12 @@ _TURN = 0.5  # ... and its normal is that of the ball within this angle [rad]
 # A fillet gains at least this much over a sharp edge, in squares of the noise: in all, and for each
 # point on it.
 _GAIN, _EACH = 40.0, 0.25
-_ARC = 2.0  # a fillet is at least this wide [spacings]
+_ARC = 1.5  # a fillet is at least this wide [spacings]
 _SLACK = 1.05  # its radius may be above the limit by so much: that it is not known exactly
 _FEWEST = 8
+# Its points are no farther from the ball than from the surfaces of their patches, times this, plus
+# so many noises.
+_WORSE, _EVEN = 1.2, 0.3
 _FRESH = 0.5  # ... and this share of its points is on no better one
 _STRIP_SHARE = 0.5  # a patch is the strip of a fillet when so much of it is claimed
 _REFIT = 300
@@ -116,8 +119,8 @@ class Search:
 
     def __init__(
         self,
-        points: np.ndarray,
-        normals: np.ndarray,
+        points: Any,
+        normals: Any,
         leaves: Leaves,
         label: np.ndarray,
         surface: np.ndarray,
@@ -126,9 +129,10 @@ class Search:
         spacing: float,
         limit: float,
     ) -> None:
-        self.points, self.normals, self.leaves, self.label = points, normals, leaves, label
+        self.device = points, normals
+        self.points, self.normals = runtime.download(points), runtime.download(normals)
+        self.leaves, self.label = leaves, label
         self.noise, self.spacing, self.limit = noise, spacing, limit
-        self.device = runtime.upload(points), runtime.upload(normals)
         self.count = len(surface)
         self.analytic = surface >= 0
         order = np.argsort(label, kind="stable")
@@ -141,9 +145,16 @@ class Search:
             self.table[:, :8], self.table[:, 8] = surfaces.parameters[which], surfaces.kind[which]
         self.table[~self.analytic] = 0.0
         self.set_sides()
+        # Distance of every point from the surface of its patch [mm], capped.
+        self.off = np.full(len(label), _CAP * noise)
+        there = np.flatnonzero((label >= 0) & self.analytic[np.maximum(label, 0)])
+        far, _ = evaluate_surfaces(
+            self.points[there], label[there], self.table[:, 8].astype(np.int32), self.table[:, :8]
+        )
+        self.off[there] = np.minimum(np.abs(far), _CAP * noise)
         self.own = label_lists(leaves, label)
         self.near = near_lists(leaves, self.own)
-        self.claim = np.full(len(points), NONE, np.int32)
+        self.claim = np.full(len(label), NONE, np.int32)
 
     def set_sides(self) -> None:
         """Say for every surface on which side the air is."""
@@ -160,7 +171,9 @@ class Search:
         """Place points on profiles."""
         return place(*self.device, self.table, pairs, radius, point, pair)
 
-    def sums(self, task: np.ndarray, shape: np.ndarray, entry: np.ndarray, cap: float) -> np.ndarray:
+    def sums(
+        self, task: np.ndarray, shape: np.ndarray, entry: np.ndarray, cap: float
+    ) -> np.ndarray:
         """Sum up how profiles fit."""
         return sums(self.device[0], self.table, task, shape, entry, cap)
 
@@ -168,6 +181,10 @@ class Search:
         """Return how far from the sharp edge a fillet can reach [mm]."""
         wide = np.minimum(np.tan(turn / 2.0), 3.0)
         return _MOST * self.limit * wide + _EDGE * self.spacing
+
+    def absorbed(self) -> float:
+        """Return how wide a piece of a fillet may pass as a part of the surface beside it [mm]."""
+        return float(np.sqrt(2.0 * _CAP * self.noise * self.limit)) + 1.5 * self.spacing
 
     def shapes(self) -> np.ndarray:
         """Return the radii that are tried and their signs: convex, then concave; 0 first."""
@@ -235,9 +252,7 @@ def strips_between(search: Search, touching: np.ndarray) -> np.ndarray:
     entry, owner = listed_for(triple)
     at = search.place(triple[:, 1:], np.zeros(len(triple)), entry, owner)
     inside = (at.region != NOWHERE) & (at.along <= search.reach(at.turn))
-    triple = triple[
-        np.bincount(owner, inside, len(triple)) >= _BETWEEN * size[triple[:, 0]]
-    ]
+    triple = triple[np.bincount(owner, inside, len(triple)) >= _BETWEEN * size[triple[:, 0]]]
     if len(triple) == 0:
         return triple
     shapes = search.shapes()
@@ -266,7 +281,10 @@ def find_zones(search: Search) -> Zones:
     cell, first = cell[order], np.searchsorted(name[order], np.arange(search.count + 1))
     each = (first[1:] - first[:-1])[triple[:, 0]]
     along = cell[ranges(first[triple[:, 0]], each)]
-    real = search.analytic[pairs].all(axis=1)
+    # Large leaves are far inside a patch: their points say nothing about its edges.
+    size = search.leaves.size
+    small = size <= max(2.0 * size.min(), search.absorbed())
+    real = search.analytic[pairs].all(axis=1) & small[leaf]
     key = np.concatenate(
         [
             (pairs[real, 0].astype(np.int64) * width + pairs[real, 1]) * cells + leaf[real],
@@ -274,6 +292,7 @@ def find_zones(search: Search) -> Zones:
         ]
     )
     key = np.unique(key)
+    key = key[small[key % cells]]
     code, which = np.unique(key // cells, return_inverse=True)
     pairs = np.column_stack([code // width, code % width])
     number = np.arange(len(code))
@@ -360,12 +379,18 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
     on = (at.region == BALL) & (np.abs(at.off) <= _ON * search.noise)
     on &= at.cosine >= np.cos(_TURN)
     point, pair = point[on], pair[on]
+    # What the surfaces of patches explain better is no fillet: a chamfer, a step.
+    aside = (search.label[point][:, None] != zones.pairs[pair]).all(axis=1)
+    number = np.bincount(pair, aside, len(zones.pairs))
+    ball = np.bincount(pair, aside * at.off[on] ** 2, len(zones.pairs))
+    flat = np.bincount(pair, aside * search.off[point] ** 2, len(zones.pairs))
+    better = ball <= _WORSE**2 * flat + (_EVEN * search.noise) ** 2 * number
     ends = np.searchsorted(pair, np.arange(len(zones.pairs) + 1))
     support = np.diff(ends)
     search.claim[:] = NONE
     chosen = np.zeros(len(zones.pairs), bool)
     for p in np.argsort(-support * fit.quality, kind="stable"):
-        if support[p] < _FEWEST:
+        if support[p] < _FEWEST or not better[p]:
             continue
         mine = point[ends[p] : ends[p + 1]]
         fresh = mine[search.claim[mine] < 0]
@@ -383,7 +408,10 @@ def refit_sides(search: Search) -> None:
     )
     left = search.size - claimed
     again = np.flatnonzero(
-        search.analytic & (claimed > 0.01 * search.size) & (left >= 0.5 * search.size) & (left >= 50)
+        search.analytic
+        & (claimed > 0.01 * search.size)
+        & (left >= 0.5 * search.size)
+        & (left >= 50)
     )
     if len(again) == 0:
         return
@@ -402,8 +430,8 @@ def refit_sides(search: Search) -> None:
 
 
 def find_borders(
-    points: np.ndarray,
-    normals: np.ndarray,
+    points: Any,
+    normals: Any,
     leaves: Leaves,
     label: np.ndarray,
     surface: np.ndarray,
@@ -416,8 +444,9 @@ def find_borders(
     """Find the edges between patches, and the fillets.
 
     Args:
-        points: Sorted positions relative to the corner of the grid [mm], shape (n, 3), f64.
-        normals: Their normals, shape (n, 3), f64.
+        points: Sorted positions relative to the corner of the grid [mm], shape (n, 3), f64 (kernel
+            array).
+        normals: Their unit normals, shape (n, 3), f64 (kernel array).
         leaves: The leaves.
         label: Patch of every point, -1 = none, shape (n,), i32.
         surface: Surface of every patch, -1 = none, shape (K,), i32.
@@ -503,7 +532,7 @@ def mark_points(
         (np.flatnonzero(chosen[pair] & ~ball), search.claim, pair),
     ):
         distance = nearest_marked(
-            self_points(search), marks, leaves, box, point[k], leaf[k], wanted[k], far[k]
+            search.device[0], marks, leaves, box, point[k], leaf[k], wanted[k], far[k]
         )
         found[k] = np.isfinite(distance)
     point, pair, along = point[found], pair[found], along[found]
@@ -515,10 +544,6 @@ def mark_points(
     edge[point[order]] = code[pair[order]]
     edge[search.claim >= 0] = int(EdgeClass.FILLET)
     return edge
-
-
-def self_points(search: Search) -> Any:
-    return search.device[0]
 
 
 def smooth_pairs(search: Search, pairs: np.ndarray, turn: np.ndarray) -> np.ndarray:

@@ -16,15 +16,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.params import Params
 from octoseg_ti.patches import Regions
-from octoseg_ti.stages.extraction import (
-    Surfaces,
-    Tolerance,
-    explain,
-    fit_sets,
-    lie_on,
-    no_surfaces,
-    spread,
-)
+from octoseg_ti.stages.extraction import Tolerance, explain
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import (
     Choice,
@@ -43,18 +35,23 @@ from octoseg_ti.stages.merging import (
     merge_surfaces,
     pieces,
 )
+from octoseg_ti.stages.sets import Surfaces, fit_sets, lie_on, no_surfaces, spread
 from octoseg_ti.types import NONE
 
-_ROUNDS = 3
+_ROUNDS = 2
 # Points of a leaf that speak for it: of all its points, and of those that fit nothing.
 _SAMPLES, _REST = 4, 6
 # A leaf takes part in a new group when so many of its points fit nothing.
 _LEFT_POINTS = 2
 # Samples for fitting a surface anew.
 _REFIT = 300
+# ... away from other surfaces, if there are so many of these.
+_INNER = 40
 # A surface is given up when its neighbours explain its points with this mean square, in noises.
 _EXPLAINED = 2.0
 _MERGES = 3
+# By how much the cost of a surface found late must be lower, in squares of noises.
+_HANDICAP = 2.0
 # A free form has at least this many times the points of the smallest patch.
 _FREE = 10.0
 # A point that fits nothing joins a patch within so many times the usual reach.
@@ -82,7 +79,10 @@ class _Search:
         self.surfaces = no_surfaces()
         self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
         self.choice: Choice | None = None
-        # Leaves of free forms choose nothing; what fits nothing in a flat face is no group.
+        # Surfaces found in what others left have to be clearly better where others fit.
+        self.early = 0
+        # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut out
+        # of a group, is no group of its own.
         self.free = np.zeros(len(leaves), bool)
         self.face = np.zeros(len(leaves), bool)
 
@@ -94,22 +94,21 @@ class _Search:
 
     def choose(self, passes: int = 1) -> None:
         """Let the points choose among the surfaces that have points near them."""
-        table = surface_table(
-            self.surfaces.kind, self.surfaces.parameters, np.zeros(len(self.surfaces))
-        )
+        late = np.arange(len(self.surfaces)) >= self.early
+        table = surface_table(self.surfaces.kind, self.surfaces.parameters, _HANDICAP * late)
         self.choice, self.own = label_points(
             self.grid, self.leaves, self.own, table, self.rule, passes=passes, closed=self.free
         )
 
-    def add(
-        self, samples: Samples, sets: list[np.ndarray], whole_only: np.ndarray | None = None
-    ) -> bool:
+    def add(self, samples: Samples, sets: list[np.ndarray], *, apart: bool = True) -> bool:
         """Explain sets of samples; say whether that gave any new surface."""
-        new, label = explain(samples, self.leaves, sets, self.tolerance, whole_only=whole_only)
+        new, label = explain(samples, self.leaves, sets, self.tolerance, apart=apart)
         for members in sets:
             large = samples.weight[members].sum() >= _FREE * self.tolerance.points
-            if large and not np.any(label[members] >= 0):
-                self.free[samples.leaf[members]] = True
+            explained = np.any(label[members] >= 0)
+            if large or explained:
+                self.free[samples.leaf[members]] = not explained
+                self.face[samples.leaf[members]] |= not apart
         if len(new) == 0:
             return False
         base = len(self.surfaces)
@@ -127,6 +126,14 @@ class _Search:
         """Fit the surfaces anew to the samples that chose them."""
         label = self.label[self.samples.index]
         members = members_of(label, len(self.surfaces))
+        # Points beside other surfaces may belong to these: where there are enough, others count.
+        inner = members_of(
+            np.where(self.inner()[self.samples.leaf], label, NONE), len(self.surfaces)
+        )
+        members = [
+            i if len(i) >= _INNER and 4 * len(i) >= len(m) else m
+            for i, m in zip(inner, members, strict=True)
+        ]
         which = np.array([m for m, s in enumerate(members) if len(s) >= 10], np.int64)
         sets = [spread(members[m], _REFIT) for m in which]
         noise = self.tolerance.noise
@@ -138,6 +145,15 @@ class _Search:
             if new[k].mean() >= old[k].mean() - 0.01:
                 kind[which[f]], parameters[which[f]] = fits.kind[k], fits.parameters[k]
         self.surfaces = Surfaces(kind=kind, parameters=parameters)
+
+    def inner(self) -> np.ndarray:
+        """Return which leaves are full of one surface, as are all that touch them; (C,), bool."""
+        common = common_label(self.leaves, self.label)
+        border = common[self.leaves.a] != common[self.leaves.b]
+        inner = common >= 0
+        inner[self.leaves.a[border]] = False
+        inner[self.leaves.b[border]] = False
+        return inner
 
     def rename(self, name: np.ndarray) -> None:
         """Give surfaces other numbers; -1 gives them up."""
@@ -196,7 +212,7 @@ def find_surfaces(
     grid: Grid,
     leaves: Leaves,
     group: np.ndarray,
-    face: np.ndarray,
+    cut: np.ndarray,
     tolerance: Tolerance,
     rule: Rule,
 ) -> Surfaced:
@@ -206,34 +222,43 @@ def find_surfaces(
         grid: The sparse grid.
         leaves: Its leaves.
         group: Group of every leaf that the flood fill reached, -1 = none, shape (C,), i32.
-        face: Leaves of flat faces that were cut apart at bends, shape (C,), bool: each is one
-            surface or none.
+        cut: The same with groups of flat faces cut apart at the bends between them. It counts where
+            a group is no sum of surfaces: each of its faces may still be one.
         tolerance: What counts as lying on a surface.
         rule: What a point may differ from the surface that it takes.
     """
     search = _Search(grid, leaves, tolerance, rule)
-    search.face = face
     samples = search.samples
-    part = group[samples.leaf]
-    size = np.bincount(group[group >= 0], leaves.count[group >= 0], minlength=1)
-    sets = [
-        s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= tolerance.points
-    ]
-    flat = np.array([face[samples.leaf[s[0]]] for s in sets], bool)
-    for turn in range(_ROUNDS):
-        if not search.add(samples, sets, flat if turn == 0 else None) and turn > 0:
-            break
+    search.add(samples, _sets_of(samples, leaves, group, tolerance.points))
+    if search.free.any():
+        inside = np.where(search.free, cut, NONE)
+        faces = _sets_of(samples, leaves, inside, tolerance.points)
+        search.add(samples, faces, apart=False)
+    search.early = len(search.surfaces)
+    for _ in range(_ROUNDS):
         search.choose(passes=2)
         search.refit()
         search.choose()
-        samples, sets = search.rest()
-        if not sets:
+        rest, sets = search.rest()
+        if not sets or not search.add(rest, sets):
             break
+    else:
+        search.choose(passes=2)
     for _ in range(_MERGES):
         merged = search.merge()
         if not search.give_up() and not merged:
             break
+    search.early = len(search.surfaces)
+    search.choose()
     return Surfaced(surfaces=search.surfaces, label=search.label, own=search.own)
+
+
+def _sets_of(samples: Samples, leaves: Leaves, group: np.ndarray, least: float) -> list[np.ndarray]:
+    """Return the samples of every group that has enough points."""
+    part = group[samples.leaf]
+    there = group >= 0
+    size = np.bincount(group[there], leaves.count[there], minlength=1)
+    return [s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= least]
 
 
 def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params) -> Regions:
@@ -252,7 +277,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
     turn = max(TURNS[0], TURNS[1] * tilt)
     rule = Rule(noise, tilt)
     surfaced = find_surfaces(
-        grid, graph, found.group[leaves], found.face[leaves], Tolerance(noise, turn, least), rule
+        grid, graph, found.group[leaves], found.cut[leaves], Tolerance(noise, turn, least), rule
     )
     label, surface = number_pieces(graph, surfaced, least)
     # Regions of which surfaces explain less than half stay; they are free forms.
@@ -268,7 +293,6 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         table = surface_table(
             surfaced.surfaces.kind[surface],
             surfaced.surfaces.parameters[surface],
-            np.zeros(len(surface)),
         )
         loose = rule._replace(reach=_LOOSE * rule.reach, turn=float(np.pi))
         own = label_lists(graph, np.where(label < len(surface), label, NONE))
@@ -284,6 +308,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         surface=np.concatenate([surface, np.full(len(stay), NONE, np.int32)]),
         kind=surfaced.surfaces.kind,
         parameters=surfaced.surfaces.parameters,
+        graph=graph,
     )
 
 

@@ -61,7 +61,9 @@ def _nearest(
             b = neighbor_in[k]
             j = start_in[b]
             while j < start_in[b + 1] and least >= reach:
-                least = _in_leaf(point_in, mark_in, leaf_in, box_in, neighbor_in[j], i, wanted, least)
+                least = _in_leaf(
+                    point_in, mark_in, leaf_in, box_in, neighbor_in[j], i, wanted, least
+                )
                 j += 1
             k += 1
         distance_inout[e] = ti.select(least < reach, ti.sqrt(least), ti.math.inf)

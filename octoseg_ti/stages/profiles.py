@@ -125,7 +125,9 @@ def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, r
             normal = mb
             off = db
             along = (u + (hollow * y) * mb).norm()
-        result = vec8(off, along, ti.cast(region, ti.f64), g, change, normal[0], normal[1], normal[2])
+        result = vec8(
+            off, along, ti.cast(region, ti.f64), g, change, normal[0], normal[1], normal[2]
+        )
     return result
 
 
