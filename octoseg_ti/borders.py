@@ -50,6 +50,7 @@ _GAIN, _EACH = 40.0, 0.25
 _ARC = 1.5  # a fillet is at least this wide [spacings]
 _SLACK = 1.05  # its radius may be above the limit by so much: that it is not known exactly
 _FEWEST = 8
+_SHARED = 2.0  # neighbours share some of their noise, and the sides are not known exactly
 # Its points are no farther from the ball than from the surfaces of their patches, times this, plus
 # so many noises.
 _WORSE, _EVEN = 1.2, 0.3
@@ -407,7 +408,7 @@ def fit_balls(search: Search, zones: Zones) -> Fit:
     )
     return Fit(
         radius=radius * hollow,
-        deviation=np.maximum(rms, 0.3 * noise) / np.sqrt(np.maximum(now[:, 2], 1e-12)),
+        deviation=_SHARED * np.maximum(rms, 0.3 * noise) / np.sqrt(np.maximum(now[:, 2], 1e-12)),
         hollow=hollow,
         turn=turn,
         points=total,
