@@ -128,8 +128,6 @@ class Truth:
     """Distance to the nearest true edge [mm], shape (N,), f32; 0 on a fillet strip."""
     edge_class: np.ndarray | None = None
     """`EdgeClass` of that nearest edge, shape (N,), u8."""
-    radius: np.ndarray | None = None
-    """Radius of the fillet that a point lies on [mm], shape (N,), f32; NaN on no fillet."""
     T_world_view: np.ndarray | None = None
     """True pose of every view: maps view to world, shape (V, 4, 4), f64."""
     artefact: np.ndarray | None = None
@@ -137,6 +135,8 @@ class Truth:
     any."""
     info: dict[str, str] = field(default_factory=dict)
     """How the truth came about: part, seed, noise."""
+    radius: np.ndarray | None = None
+    """Radius of the fillet that a point lies on [mm], shape (N,), f32; NaN on no fillet."""
 
     def __len__(self) -> int:
         """Return the number of points."""
