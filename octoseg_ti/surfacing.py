@@ -81,8 +81,8 @@ class _Search:
         self.choice: Choice | None = None
         # Surfaces found in what others left have to be clearly better where others fit.
         self.early = 0
-        # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut out
-        # of a group, is no group of its own.
+        # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut
+        # out of a group, is no group of its own.
         self.free = np.zeros(len(leaves), bool)
         self.face = np.zeros(len(leaves), bool)
 
@@ -253,16 +253,12 @@ def find_surfaces(
     return Surfaced(surfaces=search.surfaces, label=search.label, own=search.own)
 
 
-def _sets_of(
-    samples: Samples, leaves: Leaves, group: np.ndarray, least: float
-) -> list[np.ndarray]:
+def _sets_of(samples: Samples, leaves: Leaves, group: np.ndarray, least: float) -> list[np.ndarray]:
     """Return the samples of every group that has enough points."""
     part = group[samples.leaf]
     there = group >= 0
     size = np.bincount(group[there], leaves.count[there], minlength=1)
-    return [
-        s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= least
-    ]
+    return [s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= least]
 
 
 def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params) -> Regions:

@@ -213,7 +213,9 @@ def surface_table(
         parameters: As in `Segmentation.parameters`, shape (M, 8).
         handicap: What is added to the cost of every surface, shape (M,); None = nothing.
     """
-    return np.column_stack([parameters, kind, np.zeros(len(kind)) if handicap is None else handicap])
+    return np.column_stack(
+        [parameters, kind, np.zeros(len(kind)) if handicap is None else handicap]
+    )
 
 
 def label_points(
