@@ -19,11 +19,10 @@ from octoseg_ti.patches import Regions
 from octoseg_ti.stages.extraction import Tolerance, explain
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import (
-    Choice,
+    Labelling,
     Rule,
     common_label,
     label_lists,
-    label_points,
     own_lists,
     surface_table,
 )
@@ -72,11 +71,11 @@ class _Search:
     """What the rounds of the search share."""
 
     def __init__(self, grid: Grid, leaves: Leaves, tolerance: Tolerance, rule: Rule) -> None:
-        self.grid, self.leaves, self.tolerance, self.rule = grid, leaves, tolerance, rule
+        self.grid, self.leaves, self.tolerance = grid, leaves, tolerance
         self.samples = sample_leaves(grid, leaves, _SAMPLES)
         self.surfaces = no_surfaces()
         self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
-        self.choice: Choice | None = None
+        self.labelling = Labelling(grid, leaves, rule)
         # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut out
         # of a group, is no group of its own.
         self.free = np.zeros(len(leaves), bool)
@@ -85,17 +84,14 @@ class _Search:
     @property
     def label(self) -> np.ndarray:
         """Return the label of every sorted point."""
-        assert self.choice is not None
-        return runtime.download(self.choice.label)
+        return runtime.download(self.labelling.choice.label)
 
     def choose(self, passes: int = 1) -> None:
         """Let the points choose among the surfaces that have points near them."""
         table = surface_table(
             self.surfaces.kind, self.surfaces.parameters, np.zeros(len(self.surfaces))
         )
-        self.choice, self.own = label_points(
-            self.grid, self.leaves, self.own, table, self.rule, passes=passes, closed=self.free
-        )
+        self.own = self.labelling.choose(self.own, table, passes=passes, closed=self.free)
 
     def add(self, samples: Samples, sets: list[np.ndarray], *, apart: bool = True) -> bool:
         """Explain sets of samples; say whether that gave any new surface."""
@@ -189,11 +185,10 @@ class _Search:
 
     def give_up(self) -> bool:
         """Give up surfaces that their neighbours explain; say whether there were any."""
-        assert self.choice is not None
         gone = explained_by_others(
             self.label,
-            runtime.download(self.choice.second),
-            runtime.download(self.choice.off),
+            runtime.download(self.labelling.choice.second),
+            runtime.download(self.labelling.choice.off),
             len(self.surfaces),
             _EXPLAINED,
         )
@@ -295,8 +290,10 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         )
         loose = rule._replace(reach=_LOOSE * rule.reach, turn=float(np.pi))
         own = label_lists(graph, np.where(label < len(surface), label, NONE))
-        choice, _ = label_points(grid, graph, own, table, loose)
-        label = np.where(label < 0, runtime.download(choice.label), label)
+        labelling = Labelling(grid, graph, loose)
+        full = ~np.logical_or.reduceat(label < 0, graph.first)
+        labelling.choose(own, table, closed=full)
+        label = np.where(label < 0, runtime.download(labelling.choice.label), label)
     held = np.full(grid.count, NONE, np.int32)
     held[leaves] = common_label(graph, label)
     return replace(
