@@ -322,8 +322,10 @@ def number_pieces(leaves: Leaves, found: Surfaced, least: float) -> tuple[np.nda
     leaf = np.repeat(np.arange(len(leaves)), leaves.count)
     there = found.label >= 0
     cell, name = leaf[there], found.label[there]
-    rank = (found.own[cell] == name[:, None]).argmax(axis=1)
-    mine = piece[cell, rank]
+    mine = piece[cell, 0]
+    others = np.flatnonzero(found.own[cell, 0] != name)
+    rank = (found.own[cell[others]] == name[others, None]).argmax(axis=1)
+    mine[others] = piece[cell[others], rank]
     size = np.bincount(mine)
     names = np.flatnonzero(size >= max(least, 1))
     names = names[np.argsort(-size[names], kind="stable")]
@@ -331,7 +333,4 @@ def number_pieces(leaves: Leaves, found: Surfaced, least: float) -> tuple[np.nda
     number[names] = np.arange(len(names), dtype=np.int32)
     label = np.full(len(found.label), NONE, np.int32)
     label[there] = number[mine]
-    surface = np.zeros(len(names), np.int32)
-    kept = label[there] >= 0
-    surface[label[there][kept]] = name[kept]
-    return label, surface
+    return label, found.own[found.own >= 0][names]  # pieces are named by an entry of the lists
