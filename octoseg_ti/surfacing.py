@@ -28,11 +28,11 @@ from octoseg_ti.stages.labelling import (
 )
 from octoseg_ti.stages.leaves import Leaves, Samples, leaf_graph, sample_leaves
 from octoseg_ti.stages.merging import (
-    contacts,
     explained_by_others,
     members_of,
     merge_surfaces,
     pieces,
+    smooth_contacts,
 )
 from octoseg_ti.stages.sets import Surfaces, fit_sets, lie_on, no_surfaces, spread
 from octoseg_ti.types import NONE
@@ -76,6 +76,8 @@ class _Search:
         self.surfaces = no_surfaces()
         self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
         self.labelling = Labelling(grid, leaves, rule)
+        # Pairs of surfaces that were found not to be one.
+        self.apart = np.zeros(0, np.int64)
         # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut out
         # of a group, is no group of its own.
         self.free = np.zeros(len(leaves), bool)
@@ -173,12 +175,20 @@ class _Search:
     def merge(self) -> bool:
         """Merge surfaces that are one; say whether there were any."""
         label = self.label[self.samples.index]
-        pairs, _ = contacts(self.leaves, self.own)
+        pairs = smooth_contacts(self.leaves, self.own, self.samples, self.surfaces)
+        key = pairs[:, 0] * len(self.surfaces) + pairs[:, 1]
         name, self.surfaces = merge_surfaces(
-            self.samples, label, self.surfaces, pairs, self.tolerance.noise
+            self.samples,
+            label,
+            self.surfaces,
+            pairs[~np.isin(key, self.apart)],
+            self.tolerance.noise,
         )
-        if np.array_equal(name, np.arange(len(name))):
+        changed = name != np.arange(len(name))
+        if not changed.any():
             return False
+        changed[name[changed]] = True
+        self.apart = key[~changed[pairs].any(axis=1)]
         self.rename(name)
         self.choose()
         return True

@@ -20,6 +20,8 @@ _FIT = 1.2
 _CAP = 4.0
 # A surface with fewer samples says nothing about another.
 _FEW = 10
+# Surfaces whose normals differ by more than this where they meet [rad] meet at an edge.
+_EDGE = 0.7
 _UNIT = 1024.0
 # What deviates by no more than this many noises and tilts, and is no larger than this share of the
 # surface beside it, is an error of its form.
@@ -37,6 +39,35 @@ def contacts(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         The pairs, smaller number first, ascending, shape (P, 2); and how many leaves and pairs of
         leaves each was found in, shape (P,).
     """
+    one, other, _ = _touches(leaves, own)
+    key, count = np.unique(_keys(one, other, own), return_counts=True)
+    return _pairs_of(key, own), count
+
+
+def smooth_contacts(
+    leaves: Leaves, own: np.ndarray, samples: Samples, surfaces: Surfaces
+) -> np.ndarray:
+    """Return the pairs of surfaces that do not meet at an edge: only these can be one.
+
+    Args:
+        leaves: The leaves.
+        own: As of `contacts`.
+        samples: Samples of all leaves, in their order.
+        surfaces: The surfaces.
+
+    Returns:
+        Of the pairs of `contacts` those whose normals agree somewhere where they touch.
+    """
+    one, other, leaf = _touches(leaves, own)
+    point = samples.point[np.searchsorted(samples.leaf, leaf)]
+    _, n = evaluate_surfaces(point, one, surfaces.kind, surfaces.parameters)
+    _, m = evaluate_surfaces(point, other, surfaces.kind, surfaces.parameters)
+    smooth = np.abs(np.einsum("ij,ij->i", n, m)) >= np.cos(_EDGE)
+    return _pairs_of(np.unique(_keys(one, other, own)[smooth]), own)
+
+
+def _touches(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return two surfaces, and a leaf, for every place where these touch."""
     held = (own >= 0).sum(axis=1)
     cells = np.arange(len(own), dtype=np.int32)
     a, b = np.concatenate([leaves.a, cells]), np.concatenate([leaves.b, cells])
@@ -48,10 +79,17 @@ def contacts(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rank = np.arange(len(at)) - np.repeat(np.cumsum(each) - each, each)
     one, other = own[a[at], rank // held[b[at]]], own[b[at], rank % held[b[at]]]
     differ = one != other
-    low, high = np.minimum(one, other)[differ], np.maximum(one, other)[differ]
+    return one[differ], other[differ], a[at[differ]]
+
+
+def _keys(one: np.ndarray, other: np.ndarray, own: np.ndarray) -> np.ndarray:
     width = int(own.max(initial=0)) + 1
-    key, count = np.unique(low.astype(np.int64) * width + high, return_counts=True)
-    return np.stack([key // width, key % width], axis=1), count
+    return np.minimum(one, other).astype(np.int64) * width + np.maximum(one, other)
+
+
+def _pairs_of(key: np.ndarray, own: np.ndarray) -> np.ndarray:
+    width = int(own.max(initial=0)) + 1
+    return np.stack([key // width, key % width], axis=1)
 
 
 def members_of(label: np.ndarray, count: int) -> list[np.ndarray]:
