@@ -37,6 +37,7 @@ STAGES = (
 # A cell bends away from its mean plane by 0.13 tolerance times its size at most while its normals
 # are within the tolerance; twice that can only be a step.
 _FLATNESS = 0.25
+_LONGEST = 1e30
 
 
 def segment(
@@ -312,7 +313,9 @@ def explain_regions(
     asked: SurfaceParams,
 ) -> tuple[Measurement, Params, Regions]:
     """Find the analytic surfaces of the regions, and give the points to them."""
-    if not params.surfaces.enabled:
+    extent = grid.size * max(grid.shape)
+    # Fits add up fourth powers of lengths, which beyond this leave the range of numbers.
+    if not params.surfaces.enabled or not 1.0 / _LONGEST < extent < _LONGEST:
         return measured, params, found
     measured = replace(measured, surface_noise=surface_noise(grid))
     params = derive(replace(params, surfaces=asked), measured)

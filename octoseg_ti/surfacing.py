@@ -49,6 +49,8 @@ _INNER = 40
 # A surface is given up when its neighbours explain its points with this mean square, in noises.
 _EXPLAINED = 2.0
 _MERGES = 3
+# By how much the cost of a surface found late must be lower, in squares of noises.
+_HANDICAP = 2.0
 # A free form has at least this many times the points of the smallest patch.
 _FREE = 10.0
 # A point that fits nothing joins a patch within so many times the usual reach.
@@ -78,8 +80,10 @@ class _Search:
         self.labelling = Labelling(grid, leaves, rule)
         # Pairs of surfaces that were found not to be one.
         self.apart = np.zeros(0, np.int64)
-        # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut out
-        # of a group, is no group of its own.
+        # Surfaces found in what others left have to be clearly better where others fit.
+        self.early = 0
+        # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut
+        # out of a group, is no group of its own.
         self.free = np.zeros(len(leaves), bool)
         self.face = np.zeros(len(leaves), bool)
 
@@ -90,9 +94,8 @@ class _Search:
 
     def choose(self, passes: int = 1) -> None:
         """Let the points choose among the surfaces that have points near them."""
-        table = surface_table(
-            self.surfaces.kind, self.surfaces.parameters, np.zeros(len(self.surfaces))
-        )
+        late = np.arange(len(self.surfaces)) >= self.early
+        table = surface_table(self.surfaces.kind, self.surfaces.parameters, _HANDICAP * late)
         self.own = self.labelling.choose(self.own, table, passes=passes, closed=self.free)
 
     def add(self, samples: Samples, sets: list[np.ndarray], *, apart: bool = True) -> bool:
@@ -236,6 +239,7 @@ def find_surfaces(
         inside = np.where(search.free, cut, NONE)
         faces = _sets_of(samples, leaves, inside, tolerance.points)
         search.add(samples, faces, apart=False)
+    search.early = len(search.surfaces)
     for _ in range(_ROUNDS):
         search.choose(passes=2)
         search.refit()
@@ -249,19 +253,17 @@ def find_surfaces(
         merged = search.merge()
         if not search.give_up() and not merged:
             break
+    search.early = len(search.surfaces)
+    search.choose()
     return Surfaced(surfaces=search.surfaces, label=search.label, own=search.own)
 
 
-def _sets_of(
-    samples: Samples, leaves: Leaves, group: np.ndarray, least: float
-) -> list[np.ndarray]:
+def _sets_of(samples: Samples, leaves: Leaves, group: np.ndarray, least: float) -> list[np.ndarray]:
     """Return the samples of every group that has enough points."""
     part = group[samples.leaf]
     there = group >= 0
     size = np.bincount(group[there], leaves.count[there], minlength=1)
-    return [
-        s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= least
-    ]
+    return [s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= least]
 
 
 def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params) -> Regions:
@@ -296,7 +298,6 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         table = surface_table(
             surfaced.surfaces.kind[surface],
             surfaced.surfaces.parameters[surface],
-            np.zeros(len(surface)),
         )
         loose = rule._replace(reach=_LOOSE * rule.reach, turn=float(np.pi))
         own = label_lists(graph, np.where(label < len(surface), label, NONE))

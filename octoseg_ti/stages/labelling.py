@@ -126,21 +126,25 @@ def _choose(
                 axis = vec3(surface_in[s, 3], surface_in[s, 4], surface_in[s, 5])
                 d, n = surface_at(kind, p, origin, axis, surface_in[s, 6], surface_in[s, 7])
                 off = ti.abs(d) / rule[0]
-                if off * off < next_best:
-                    cosine = ti.abs(n.dot(m))
-                    if surface_in[s, 9] != 0.0:  # the side is known: the back of a wall is another
-                        cosine = surface_in[s, 9] * n.dot(m)
-                    angle = ti.acos(ti.max(-1.0, ti.min(1.0, cosine)))
+                least = off * off + surface_in[s, 9]
+                if least < next_best or (off <= rule[2] and least < best):
+                    angle = ti.acos(ti.min(1.0, ti.abs(n.dot(m))))
                     if m.norm_sqr() == 0.0:
                         angle = 0.0
                     turn = angle / rule[1]
-                    cost = off * off + ti.min(turn, 6.0) * ti.min(turn, 6.0)
+                    cost = off * off + ti.min(turn, 6.0) * ti.min(turn, 6.0) + surface_in[s, 9]
                     if angle <= rule[3]:
                         if off <= rule[2] and cost < best:
-                            next_best, next_off, next_turn, second = best, best_off, best_turn, label
+                            next_best, next_off, next_turn, second = (
+                                best,
+                                best_off,
+                                best_turn,
+                                label,
+                            )
                             best, best_off, best_turn, label = cost, off, turn, s
                         elif cost < next_best:
-                            next_best, next_off, next_turn, second = cost, off, turn, s
+                            next_best, next_off, next_turn = cost, off, turn
+                            second = s
                 k += 1
             label_inout[i] = label
             second_inout[i] = second
@@ -204,15 +208,19 @@ def label_lists(leaves: Leaves, label: np.ndarray) -> np.ndarray:
     )
 
 
-def surface_table(kind: np.ndarray, parameters: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """Return surfaces as rows for kernels: parameters (8), kind, and side, shape (M, 10).
+def surface_table(
+    kind: np.ndarray, parameters: np.ndarray, handicap: np.ndarray | None = None
+) -> np.ndarray:
+    """Return surfaces as rows for kernels: parameters (8), kind, and handicap, shape (M, 10).
 
     Args:
         kind: `SurfaceKind` of every surface, analytic, shape (M,).
         parameters: As in `Segmentation.parameters`, shape (M, 8).
-        side: 1 where measured normals point outward, -1 inward, 0 = either, shape (M,).
+        handicap: What is added to the cost of every surface, shape (M,); None = nothing.
     """
-    return np.column_stack([parameters, kind, side])
+    return np.column_stack(
+        [parameters, kind, np.zeros(len(kind)) if handicap is None else handicap]
+    )
 
 
 class Labelling:
@@ -223,7 +231,9 @@ class Labelling:
         n = grid.order.shape[0]
         self.grid, self.rule, self.count = grid, rule, len(leaves)
         self.choice = Choice(
-            runtime.empty(n, np.int32), runtime.empty(n, np.int32), runtime.empty((n, 2), np.float32)
+            runtime.empty(n, np.int32),
+            runtime.empty(n, np.int32),
+            runtime.empty((n, 2), np.float32),
         )
         self._start, self._neighbor = runtime.upload(leaves.start), runtime.upload(leaves.neighbor)
         self._leaf = runtime.upload(np.stack([leaves.first, leaves.count], axis=1))

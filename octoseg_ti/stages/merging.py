@@ -14,6 +14,8 @@ from octoseg_ti.types import NONE
 _SAMPLES = 150
 # Two surfaces are one when the residual of neither grows by more than this.
 _WORSE = 1.15
+# ... or within so many noises all the same.
+_ALIKE = 1.1
 # ... and stays within this many noises.
 _FIT = 1.2
 # Distances beyond this many noises count as this many.
@@ -128,7 +130,7 @@ def merge_surfaces(
         return name, surfaces
     pairs = pairs[fitted]
     mixed, own = _residuals(samples, parts, pairs, common, surfaces, noise)
-    fine = (mixed <= np.maximum(_WORSE * own, noise)) & (mixed <= _FIT * noise)
+    fine = (mixed <= np.maximum(_WORSE * own, _ALIKE * noise)) & (mixed <= _FIT * noise)
     order = np.argsort(mixed.max(axis=1, initial=0.0), kind="stable")
     parameters, kind = surfaces.parameters.copy(), surfaces.kind.copy()
     used = np.zeros(len(surfaces), bool)
