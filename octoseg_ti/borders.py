@@ -36,7 +36,11 @@ _MANY, _SOME = 3000, 600
 _BETWEEN = 0.3
 # Radii that are tried: from the least [spacings], each larger by this ratio, up to so many limits.
 _LEAST, _RATIO, _MOST = 1.0, 1.15, 1.35
-_NEWTON = 8
+_RATIO_STRIP = 1.3  # a strip is only to be recognised
+_COARSE = 0.4  # while radii are tried, distances beyond so many spacings count as this many
+_FEW = 150  # points that these are tried on
+_HOPE = 0.03  # share of the points that a radius has to explain beyond a sharp edge, to go on
+_NEWTON = 6
 # Distances beyond this many noises count as this many; a point lies on a ball within so many.
 _CAP, _ON = 4.0, 3.5
 _TURN = 0.5  # ... and its normal is that of the ball within this angle [rad]
@@ -83,6 +87,8 @@ class Zones(NamedTuple):
     """Pair of every entry, ascending, shape (E,)."""
     leaf: np.ndarray
     """Leaf of every entry, shape (E,)."""
+    fine: np.ndarray
+    """Whether the leaf is small, shape (E,), bool: the others are next to the edge, or far off."""
     labels: np.ndarray
     """Pair and label of points that may lie on the edge, as one number, ascending."""
     count: int
@@ -103,7 +109,7 @@ class Fit(NamedTuple):
     deviation: np.ndarray
     """Its standard deviation [mm]."""
     hollow: np.ndarray
-    """1 where the sharp edge is concave, -1 where it is convex."""
+    """1 where the edge is concave, -1 where it is convex."""
     turn: np.ndarray
     """Mean angle by which the surface turns over the edge [rad]."""
     points: np.ndarray
@@ -171,6 +177,19 @@ class Search:
         """Place points on profiles."""
         return place(*self.device, self.table, pairs, radius, point, pair)
 
+    def near_edge(
+        self,
+        pairs: np.ndarray,
+        radius: np.ndarray,
+        points: np.ndarray,
+        point: np.ndarray,
+        pair: np.ndarray,
+        reach: np.ndarray,
+    ) -> np.ndarray:
+        """Say which of other points are within reach of edges."""
+        device = runtime.upload(points)
+        return place(device, device, self.table, pairs, radius, point, pair).along <= reach
+
     def sums(
         self, task: np.ndarray, shape: np.ndarray, entry: np.ndarray, cap: float
     ) -> np.ndarray:
@@ -186,12 +205,25 @@ class Search:
         """Return how wide a piece of a fillet may pass as a part of the surface beside it [mm]."""
         return float(np.sqrt(2.0 * _CAP * self.noise * self.limit)) + 1.5 * self.spacing
 
-    def shapes(self) -> np.ndarray:
-        """Return the radii that are tried and their signs: convex, then concave; 0 first."""
+    def radii(self, ratio: float) -> np.ndarray:
+        """Return the radii that are tried, each larger than the last by this ratio."""
         least = _LEAST * self.spacing
-        steps = int(np.ceil(np.log(max(_MOST * self.limit / least, 1.1)) / np.log(_RATIO))) + 1
-        radii = np.concatenate([[0.0], least * _RATIO ** np.arange(steps)])
-        return np.array([(r, sign) for sign in (-1.0, 1.0) for r in radii])
+        steps = int(np.ceil(np.log(max(_MOST * self.limit / least, 1.1)) / np.log(ratio))) + 1
+        return least * ratio ** np.arange(steps)
+
+    def coarse(self) -> float:
+        """Return the distance beyond which points count alike while radii are tried [mm]."""
+        return max(_CAP * self.noise, _COARSE * self.spacing)
+
+    def tried(
+        self, task: np.ndarray, radii: np.ndarray, hollow: np.ndarray, point: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the cost of every radius for every task, and the points on its ball."""
+        cap = self.coarse()
+        shape = np.column_stack([np.tile(radii, len(task)), np.repeat(hollow, len(radii))])
+        got = self.sums(np.repeat(task, len(radii), axis=0), shape, point, cap)
+        got = got.reshape(len(task), len(radii), 4)
+        return got[..., 0] / cap**2, got[..., 3]
 
 
 def listed(sets: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -252,21 +284,17 @@ def strips_between(search: Search, touching: np.ndarray) -> np.ndarray:
     entry, owner = listed_for(triple)
     at = search.place(triple[:, 1:], np.zeros(len(triple)), entry, owner)
     inside = (at.region != NOWHERE) & (at.along <= search.reach(at.turn))
-    triple = triple[np.bincount(owner, inside, len(triple)) >= _BETWEEN * size[triple[:, 0]]]
+    height = np.bincount(owner, inside * np.sign(at.height), len(triple))
+    kept = np.bincount(owner, inside, len(triple)) >= _BETWEEN * size[triple[:, 0]]
+    triple, hollow = triple[kept], np.where(height[kept] < 0.0, -1.0, 1.0)
     if len(triple) == 0:
         return triple
-    shapes = search.shapes()
-    shapes = shapes[shapes[:, 0] > 0.0]
-    entry, owner = listed_for(triple)
+    entry, _ = listed_for(triple)
     ends = np.cumsum(size[triple[:, 0]])
     task = np.column_stack([triple[:, 1:], ends - size[triple[:, 0]], ends])
-    cap = max(_CAP * search.noise, 0.4 * search.spacing)
-    got = search.sums(
-        np.repeat(task, len(shapes), axis=0), np.tile(shapes, (len(triple), 1)), entry, cap
-    ).reshape(len(triple), len(shapes), 4)
-    best = (got[..., 3] - got[..., 0] / cap**2).argmax(axis=1)
-    on = got[np.arange(len(triple)), best, 3]
-    return triple[on >= _BETWEEN * size[triple[:, 0]]]
+    cost, on = search.tried(task, search.radii(_RATIO_STRIP), hollow, entry)
+    best = (on - cost).argmax(axis=1)
+    return triple[on[np.arange(len(triple)), best] >= _BETWEEN * size[triple[:, 0]]]
 
 
 def find_zones(search: Search) -> Zones:
@@ -284,7 +312,7 @@ def find_zones(search: Search) -> Zones:
     # Large leaves are far inside a patch: their points say nothing about its edges.
     size = search.leaves.size
     small = size <= max(2.0 * size.min(), search.absorbed())
-    real = search.analytic[pairs].all(axis=1) & small[leaf]
+    real = search.analytic[pairs].all(axis=1)
     key = np.concatenate(
         [
             (pairs[real, 0].astype(np.int64) * width + pairs[real, 1]) * cells + leaf[real],
@@ -292,9 +320,10 @@ def find_zones(search: Search) -> Zones:
         ]
     )
     key = np.unique(key)
-    key = key[small[key % cells]]
     code, which = np.unique(key // cells, return_inverse=True)
     pairs = np.column_stack([code // width, code % width])
+    fine = small[key % cells]
+    fine |= (np.bincount(which, fine, len(code)) == 0)[which]
     number = np.arange(len(code))
     between = np.searchsorted(code, triple[:, 1] * width + triple[:, 2])
     labels = np.unique(
@@ -303,12 +332,12 @@ def find_zones(search: Search) -> Zones:
              between * width + triple[:, 0]]
         )
     )  # fmt: skip
-    return Zones(pairs, which, key % cells, labels, width)
+    return Zones(pairs, which, key % cells, fine, labels, width)
 
 
 def points_of(search: Search, zones: Zones, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the points that may lie on the edges of some pairs, and the pair of each."""
-    kept = which[zones.pair]
+    kept = which[zones.pair] & zones.fine
     leaf, pair = zones.leaf[kept], zones.pair[kept]
     count = search.leaves.count[leaf]
     point, pair = ranges(search.leaves.first[leaf], count), np.repeat(pair, count)
@@ -330,31 +359,38 @@ def fit_balls(search: Search, zones: Zones) -> Fit:
     total = np.bincount(pair, minlength=pairs)
     turn = np.bincount(pair, at.turn[kept], pairs) / np.maximum(total, 1)
     whole = total / np.maximum(share, 1e-9)
+    height = np.bincount(pair, np.sign(at.height[kept]), pairs)
+    hollow = np.where(height < 0.0, -1.0, 1.0)
     kept = thinned(pair, pairs, _SOME)
     point, pair = point[kept], pair[kept]
+    kept = thinned(pair, pairs, _FEW)
+    total = np.bincount(pair[kept], minlength=pairs)
+    ends = np.cumsum(total)
+    radii = np.concatenate([[0.0], search.radii(_RATIO)])
+    task = np.column_stack([zones.pairs, ends - total, ends])
+    cost, _ = search.tried(task, radii, hollow, point[kept])
+    best = cost.argmin(axis=1)
+    gain = (cost[:, 0] - cost.min(axis=1)) * (search.coarse() / noise) ** 2
+    hope = gain > np.maximum(_HOPE * total, 1.0)
+    radius = np.maximum(radii[best], 0.5 * search.spacing)
     total = np.bincount(pair, minlength=pairs)
     ends = np.cumsum(total)
-    task = np.column_stack([zones.pairs, ends - total, ends])
-    shapes = search.shapes()
-    cap = max(_CAP * noise, 0.4 * search.spacing)
-    got = search.sums(
-        np.repeat(task, len(shapes), axis=0), np.tile(shapes, (pairs, 1)), point, cap
-    ).reshape(pairs, len(shapes), 4)[..., 0]
-    sharp = np.where(got[:, 0] < got[:, len(shapes) // 2], -1.0, 1.0)
-    best = got.argmin(axis=1)
-    radius, hollow = np.maximum(shapes[best, 0], 0.5 * search.spacing), shapes[best, 1]
+    task = np.column_stack([zones.pairs, ends - total, ends])[hope]
+    now, none = np.zeros((pairs, 4)), np.zeros((pairs, 4))
+    shape = np.column_stack([radius, hollow])[hope]
     cap = _CAP * noise
-    for _ in range(_NEWTON):
-        now = search.sums(task, np.column_stack([radius, hollow]), point, cap)
-        step = -now[:, 1] / np.maximum(now[:, 2], 1e-12)
-        radius = np.clip(
-            radius + np.clip(step, -0.2 * radius, 0.2 * radius), 0.02, 2.0 * search.limit
-        )
-    now = search.sums(task, np.column_stack([radius, hollow]), point, cap)
-    none = search.sums(task, np.column_stack([np.zeros(pairs), hollow]), point, cap)
+    none[hope] = search.sums(task, shape * [0.0, 1.0], point, cap)
+    for turn_ in range(_NEWTON):
+        now[hope] = search.sums(task, shape, point, cap)
+        if turn_ + 1 < _NEWTON:
+            step = -now[hope, 1] / np.maximum(now[hope, 2], 1e-12)
+            least = 0.2 * shape[:, 0]
+            shape[:, 0] += np.clip(step, -least, least)
+            shape[:, 0] = np.clip(shape[:, 0], 0.02, 2.0 * search.limit)
+    radius[hope] = shape[:, 0]
     gain = (none[:, 0] - now[:, 0]) / noise**2
     rms = np.sqrt(now[:, 0] / np.maximum(total, 1))
-    good = (
+    good = hope & (
         (gain * whole >= _GAIN * np.maximum(total, 1))
         & (gain >= _EACH * now[:, 3])
         & (radius * turn >= _ARC * search.spacing)
@@ -364,7 +400,7 @@ def fit_balls(search: Search, zones: Zones) -> Fit:
     return Fit(
         radius=radius * hollow,
         deviation=np.maximum(rms, 0.3 * noise) / np.sqrt(np.maximum(now[:, 2], 1e-12)),
-        hollow=sharp,
+        hollow=hollow,
         turn=turn,
         points=total,
         good=good,
@@ -379,18 +415,24 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
     on = (at.region == BALL) & (np.abs(at.off) <= _ON * search.noise)
     on &= at.cosine >= np.cos(_TURN)
     point, pair = point[on], pair[on]
-    # What the surfaces of patches explain better is no fillet: a chamfer, a step.
-    aside = (search.label[point][:, None] != zones.pairs[pair]).all(axis=1)
-    number = np.bincount(pair, aside, len(zones.pairs))
-    ball = np.bincount(pair, aside * at.off[on] ** 2, len(zones.pairs))
-    flat = np.bincount(pair, aside * search.off[point] ** 2, len(zones.pairs))
-    better = ball <= _WORSE**2 * flat + (_EVEN * search.noise) ** 2 * number
+    # What the surface of a patch explains better is no fillet: a chamfer, the next fillet.
+    _, of = np.unique(
+        pair.astype(np.int64) * (search.count + 1) + search.label[point], return_inverse=True
+    )
+    number = np.bincount(of)
+    ball, own = np.bincount(of, at.off[on] ** 2), np.bincount(of, search.off[point] ** 2)
+    better = ball <= _WORSE**2 * own + (_EVEN * search.noise) ** 2 * number
+    side = (search.label[point][:, None] == zones.pairs[pair]).any(axis=1)
+    kept = better[of] | side
+    others = np.bincount(pair, ~side, len(zones.pairs))
+    agree = 2.0 * np.bincount(pair, kept & ~side, len(zones.pairs)) >= others
+    point, pair = point[kept], pair[kept]
     ends = np.searchsorted(pair, np.arange(len(zones.pairs) + 1))
     support = np.diff(ends)
     search.claim[:] = NONE
     chosen = np.zeros(len(zones.pairs), bool)
     for p in np.argsort(-support * fit.quality, kind="stable"):
-        if support[p] < _FEWEST or not better[p]:
+        if support[p] < _FEWEST or not agree[p]:
             continue
         mine = point[ends[p] : ends[p + 1]]
         fresh = mine[search.claim[mine] < 0]
@@ -505,6 +547,16 @@ def mark_points(
     key = np.unique(key)
     pair, leaf = key // len(leaves), key % len(leaves)
     pair, leaf = pair[~idle[pair]], leaf[~idle[pair]]
+    box = np.concatenate(
+        [np.minimum.reduceat(search.points, leaves.first),
+         np.maximum.reduceat(search.points, leaves.first)], axis=1,
+    )  # fmt: skip
+    wide = 0.5 * np.linalg.norm(box[:, 3:] - box[:, :3], axis=1)
+    kept = search.near_edge(
+        zones.pairs, radius, 0.5 * (box[:, :3] + box[:, 3:]), leaf, pair, reach + wide[leaf]
+    )
+    kept |= smooth[pair]
+    pair, leaf = pair[kept], leaf[kept]
     count = leaves.count[leaf]
     point = ranges(leaves.first[leaf], count)
     pair, leaf = np.repeat(pair, count), np.repeat(leaf, count)
@@ -521,14 +573,12 @@ def mark_points(
     point, pair, leaf, label = point[near], pair[near], leaf[near], label[near]
     along, ball = along[near], ball[near]
     other = np.where(label == zones.pairs[pair, 0], zones.pairs[pair, 1], zones.pairs[pair, 0])
-    box = np.concatenate(
-        [np.minimum.reduceat(search.points, leaves.first),
-         np.maximum.reduceat(search.points, leaves.first)], axis=1,
-    )  # fmt: skip
     found = np.ones(len(point), bool)
     far = np.where(smooth[pair], reach - 0.5 * search.spacing, along + reach)
+    # A small leaf that holds the other label needs no search.
+    held = (search.own[leaf] == other[:, None]).any(axis=1) & (2.0 * wide[leaf] <= far)
     for k, marks, wanted in (
-        (np.flatnonzero(~chosen[pair]), search.label, other),
+        (np.flatnonzero(~chosen[pair] & ~held), search.label, other),
         (np.flatnonzero(chosen[pair] & ~ball), search.claim, pair),
     ):
         distance = nearest_marked(

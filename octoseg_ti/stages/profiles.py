@@ -22,11 +22,15 @@ BALL, FIRST, SECOND, NOWHERE = 0, 1, 2, 3
 line, or there is no edge near it."""
 
 _STEPS = 4
+_CLOSE, _FAR = (
+    1e-6,
+    1e-3,
+)  # a centre is found when so near its distances [mm]; it is none so far off
 _PARALLEL = 1e-6  # squared sine of the angle between surfaces below which they have no edge
 
 _SHARP = 1e-9  # a smaller radius is none [mm]
 
-vec8 = ti.types.vector(8, ti.f64)
+vec9 = ti.types.vector(9, ti.f64)
 
 
 class Places(NamedTuple):
@@ -43,6 +47,8 @@ class Places(NamedTuple):
     """Angle by which the surface turns from one side of the edge to the other [rad]."""
     cosine: np.ndarray
     """Cosine of the angle between the normals of the point and of the profile."""
+    height: np.ndarray
+    """Heights above both surfaces, added up [mm]: above 0 = a concave edge."""
 
 
 @ti.func
@@ -59,8 +65,10 @@ def _side_at(surface_in: ti.template(), s: ti.i32, p: vec3):
 
 @ti.func
 def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, radius: ti.f64,
-                     hollow: ti.f64) -> vec8:  # fmt: skip
-    """Return (off, along, region, cosine of the turn, change of off with the radius, normal (3)).
+                     hollow: ti.f64) -> vec9:  # fmt: skip
+    """Return (off, along, region, cosine of the turn, change of off, normal (3), height).
+
+    The change is that with the radius; the height is the sum of the heights above both surfaces.
 
     The normal is that of the profile at the point, zero where there is none.
 
@@ -74,29 +82,30 @@ def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, r
     """
     c = p
     signed = hollow * radius
-    there = True
-    for _ in range(_STEPS):
-        da, na = _side_at(surface_in, a, c)
-        db, nb = _side_at(surface_in, b, c)
-        g = na.dot(nb)
+    ca, ma = _side_at(surface_in, a, p)
+    cb, mb = _side_at(surface_in, b, p)
+    da = ca
+    db = cb
+    step = 0
+    while step < _STEPS and ti.abs(ca - signed) + ti.abs(cb - signed) > _CLOSE:
+        g = ma.dot(mb)
         det = 1.0 - g * g
+        step += 1
         if det > _PARALLEL:
-            x = signed - da
-            y = signed - db
-            c += ((x - g * y) / det) * na + ((y - g * x) / det) * nb
+            x = signed - ca
+            y = signed - cb
+            c += ((x - g * y) / det) * ma + ((y - g * x) / det) * mb
+            ca, ma = _side_at(surface_in, a, c)
+            cb, mb = _side_at(surface_in, b, c)
         else:
-            there = False
-    da, na = _side_at(surface_in, a, p)
-    db, nb = _side_at(surface_in, b, p)
+            step = _STEPS
     off = da
     if ti.abs(db) < ti.abs(da):
         off = db
-    result = vec8(off, ti.math.inf, ti.cast(NOWHERE, ti.f64), 1.0, 0.0, 0.0, 0.0, 0.0)
-    ca, ma = _side_at(surface_in, a, c)
-    cb, mb = _side_at(surface_in, b, c)
+    result = vec9(off, ti.math.inf, ti.cast(NOWHERE, ti.f64), 1.0, 0.0, 0.0, 0.0, 0.0, da + db)
     g = ma.dot(mb)
     det = 1.0 - g * g
-    if there and det > _PARALLEL and ti.abs(ca - signed) + ti.abs(cb - signed) < 1e-3:
+    if det > _PARALLEL and ti.abs(ca - signed) + ti.abs(cb - signed) < _FAR:
         u = p - c
         x = -hollow * u.dot(ma)
         y = -hollow * u.dot(mb)
@@ -125,8 +134,8 @@ def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, r
             normal = mb
             off = db
             along = (u + (hollow * y) * mb).norm()
-        result = vec8(
-            off, along, ti.cast(region, ti.f64), g, change, normal[0], normal[1], normal[2]
+        result = vec9(
+            off, along, ti.cast(region, ti.f64), g, change, normal[0], normal[1], normal[2], da + db
         )
     return result
 
@@ -155,6 +164,7 @@ def _place(
         for k in ti.static(range(4)):
             place_out[e, k] = f[k]
         place_out[e, 4] = vec3(f[5], f[6], f[7]).dot(row(normal_in, entry_in[e, 0]))
+        place_out[e, 5] = f[8]
 
 
 @ti.kernel
@@ -221,8 +231,8 @@ def place(
     entries = len(point)
     if entries == 0:
         none = np.zeros(0)
-        return Places(none, none, np.zeros(0, np.int32), none, none)
-    out = runtime.empty((entries, 5), np.float64)
+        return Places(none, none, np.zeros(0, np.int32), none, none, none)
+    out = runtime.empty((entries, 6), np.float64)
     _place(
         entries,
         points,
@@ -235,7 +245,8 @@ def place(
     )
     found = runtime.download(out)
     turn = np.arccos(np.clip(found[:, 3], -1.0, 1.0))
-    return Places(found[:, 0], found[:, 1], found[:, 2].astype(np.int32), turn, found[:, 4])
+    region = found[:, 2].astype(np.int32)
+    return Places(found[:, 0], found[:, 1], region, turn, found[:, 4], found[:, 5])
 
 
 def sums(
