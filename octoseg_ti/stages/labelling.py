@@ -135,12 +135,8 @@ def _choose(
                     cost = off * off + ti.min(turn, 6.0) * ti.min(turn, 6.0) + surface_in[s, 9]
                     if angle <= rule[3]:
                         if off <= rule[2] and cost < best:
-                            next_best, next_off, next_turn, second = (
-                                best,
-                                best_off,
-                                best_turn,
-                                label,
-                            )
+                            next_best, next_off, next_turn = best, best_off, best_turn
+                            second = label
                             best, best_off, best_turn, label = cost, off, turn, s
                         elif cost < next_best:
                             next_best, next_off, next_turn = cost, off, turn
