@@ -139,8 +139,7 @@ def _choose(
                             second = label
                             best, best_off, best_turn, label = cost, off, turn, s
                         elif cost < next_best:
-                            next_best, next_off, next_turn = cost, off, turn
-                            second = s
+                            next_best, next_off, next_turn, second = cost, off, turn, s
                 k += 1
             label_inout[i] = label
             second_inout[i] = second
