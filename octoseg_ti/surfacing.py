@@ -315,6 +315,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         surface=np.concatenate([surface, np.full(len(stay), NONE, np.int32)]),
         kind=surfaced.surfaces.kind,
         parameters=surfaced.surfaces.parameters,
+        graph=graph,
     )
 
 

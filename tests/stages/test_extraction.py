@@ -48,8 +48,9 @@ def test_a_bent_sheet_comes_apart_into_faces_and_a_round(seed: int) -> None:
     kinds = [SurfaceKind.PLANE, SurfaceKind.CYLINDER, SurfaceKind.PLANE]
     assert [SurfaceKind(int(surfaces.kind[m])) for m in main] == kinds
     np.testing.assert_allclose(surfaces.parameters[main[1], 6], 5.0, atol=0.25)
-    for f in range(3):
-        assert np.mean(label[face == f] == main[f]) > 0.85
+    # The faces reach as far into the round as it is flat within the tolerance.
+    for f, share in enumerate((0.95, 0.6, 0.95)):
+        assert np.mean(label[face == f] == main[f]) > share
 
 
 def test_one_face_is_one_surface() -> None:
