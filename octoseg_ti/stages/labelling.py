@@ -202,6 +202,28 @@ def label_lists(leaves: Leaves, label: np.ndarray) -> np.ndarray:
     )
 
 
+def near_lists(leaves: Leaves, own: np.ndarray) -> np.ndarray:
+    """Return which labels have points in every leaf or in a leaf that touches it.
+
+    Args:
+        leaves: The leaves.
+        own: Labels of every leaf (`label_lists`), shape (C, MOST), i32.
+
+    Returns:
+        As ``own``.
+    """
+    runtime.ensure_started()
+    near = runtime.empty(own.shape, np.int32)
+    _gather(
+        runtime.upload(own),
+        runtime.zeros(len(own), np.int32),
+        runtime.upload(leaves.start),
+        runtime.upload(leaves.neighbor),
+        near,
+    )
+    return runtime.download(near)
+
+
 def surface_table(
     kind: np.ndarray, parameters: np.ndarray, handicap: np.ndarray | None = None
 ) -> np.ndarray:
