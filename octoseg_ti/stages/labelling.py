@@ -110,14 +110,10 @@ def _choose(
         for i in range(leaf_in[c, 0], leaf_in[c, 0] + leaf_in[c, 1]):
             p = row(point_in, i)
             m = row(normal_in, i)
-            best = 1e30
-            next_best = 1e30
+            best = vec3(1e30, 1e30, 1e30)  # cost, distance and angle
+            after = best
             label = -1
             second = -1
-            best_off = 1e30
-            best_turn = 1e30
-            next_off = 1e30
-            next_turn = 1e30
             k = 0
             while k < MOST and near_in[c, k] >= 0:
                 s = near_in[c, k]
@@ -127,24 +123,27 @@ def _choose(
                 d, n = surface_at(kind, p, origin, axis, surface_in[s, 6], surface_in[s, 7])
                 off = ti.abs(d) / rule[0]
                 least = off * off + surface_in[s, 9]
-                if least < next_best or (off <= rule[2] and least < best):
+                if least < after[0] or (off <= rule[2] and least < best[0]):
                     angle = ti.acos(ti.min(1.0, ti.abs(n.dot(m))))
                     if m.norm_sqr() == 0.0:
                         angle = 0.0
                     turn = angle / rule[1]
-                    cost = off * off + ti.min(turn, 6.0) * ti.min(turn, 6.0) + surface_in[s, 9]
+                    tilt = ti.min(turn, 6.0)
+                    this = vec3(least + tilt * tilt, off, turn)
                     if angle <= rule[3]:
-                        if off <= rule[2] and cost < best:
-                            next_best, next_off, next_turn = best, best_off, best_turn
+                        if off <= rule[2] and this[0] < best[0]:
+                            after = best
                             second = label
-                            best, best_off, best_turn, label = cost, off, turn, s
-                        elif cost < next_best:
-                            next_best, next_off, next_turn, second = cost, off, turn, s
+                            best = this
+                            label = s
+                        elif this[0] < after[0]:
+                            after = this
+                            second = s
                 k += 1
             label_inout[i] = label
             second_inout[i] = second
-            off_inout[i, 0] = ti.cast(next_off, ti.f32)
-            off_inout[i, 1] = ti.cast(next_turn, ti.f32)
+            off_inout[i, 0] = ti.cast(after[1], ti.f32)
+            off_inout[i, 1] = ti.cast(after[2], ti.f32)
             if label >= 0:
                 _insert(own_inout, c, label)
 

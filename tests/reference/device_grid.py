@@ -7,7 +7,7 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.stages.adjacency import find_touching
 from octoseg_ti.stages.grid import Grid, build_grid
-from octoseg_ti.stages.leaves import Leaves, leaf_graph
+from octoseg_ti.stages.leaves import Leaves, Samples, leaf_graph
 from octoseg_ti.stages.moments import HI, LEVEL, LO, NORMAL, POINT, X, Z
 from reference.clouds import random_surface
 from reference.graph import Leaf
@@ -70,3 +70,15 @@ def surface_leaves(seed: int, n: int = 1500) -> tuple[Grid, Leaves]:
     points, normals = random_surface(seed, n)
     grid = build_grid(points, normals, tolerance=0.05, min_cell=0.7, min_points=3)
     return grid, touching_leaves(grid)
+
+
+def samples_of(points: np.ndarray, normals: np.ndarray) -> Samples:
+    """Return points as samples, each of a leaf of its own."""
+    n = len(points)
+    return Samples(
+        index=np.arange(n, dtype=np.int32),
+        leaf=np.arange(n, dtype=np.int32),
+        point=points,
+        normal=normals,
+        weight=np.ones(n),
+    )

@@ -1,4 +1,4 @@
-"""Samples of leaves are the points with the smallest hashes; leaves whose boxes touch are a graph."""
+"""Samples are the points with the smallest hashes; leaves whose boxes touch are a graph."""
 
 import numpy as np
 import pytest
