@@ -99,7 +99,10 @@ def segment(
     with stage("regions"):
         found = grow_regions(grid, leaves, edge, measured, params)
     with stage("surfaces"):
-        measured, params, found = explain_regions(grid, leaves, found, measured, params, asked)
+        curved = arranged.run is None
+        measured, params, found = explain_regions(
+            grid, leaves, found, measured, params, asked, curved=curved
+        )
     with stage("patches"):
         result = assemble(scans, arranged, point, normal, grid, leaves, found, measured, params)
     if aligned is not None:
@@ -310,11 +313,19 @@ def explain_regions(
     measured: Measurement,
     params: Params,
     asked: SurfaceParams,
+    *,
+    curved: bool,
 ) -> tuple[Measurement, Params, Regions]:
-    """Find the analytic surfaces of the regions, and give the points to them."""
+    """Find the analytic surfaces of the regions, and give the points to them.
+
+    Where the noise was measured against planes, ``curved``, it contains curvature.
+    """
     if not params.surfaces.enabled:
         return measured, params, found
-    measured = replace(measured, surface_noise=surface_noise(grid))
+    scatter = surface_noise(grid, leaves, found.group[leaves])
+    measured = replace(measured, surface_noise=scatter)
+    if curved and scatter > 0:
+        measured = replace(measured, noise=min(measured.noise, scatter))
     params = derive(replace(params, surfaces=asked), measured)
     return measured, params, fit_surfaces(grid, leaves, found, params)
 

@@ -3,7 +3,9 @@
 Second differences along a stripe see what two neighbours do not share. What decides whether a point
 lies on a surface is more than that: steps of the range, speckle over several points, views that do
 not quite meet. It is measured where it matters, as the residual of the best analytic surface
-through neighbourhoods of about a hundred points, taken at the calmest quarter of them.
+through neighbourhoods of about a hundred points of one region, taken at the calmest quarter of
+them. Where faces are a few neighbourhoods large, nearly all would reach over an edge if regions did
+not keep them apart.
 """
 
 import numpy as np
@@ -15,33 +17,46 @@ from octoseg_ti.stages.primitives import FREEDOM, fit_all
 # Neighbourhoods, and the points of each.
 _COUNT, _POINTS = 256, 128
 _FEWEST = 24
+# The points of a neighbourhood are among so many times as many in Morton order.
+_WINDOW = 4
 _CALM = 0.25
 
 
-def surface_noise(grid: Grid) -> float:
+def surface_noise(grid: Grid, leaves: np.ndarray, group: np.ndarray) -> float:
     """Return the standard deviation of points about the surface through their neighbourhood [mm].
 
     Args:
         grid: The sparse grid: points that follow one another in Morton order are near each other.
+        leaves: The nodes that are leaves, in Morton order, shape (C,).
+        group: Region of every leaf, -1 = none, shape (C,), i32.
     """
     key = runtime.download(grid.key)
-    n = len(key)
-    begin = np.unique(np.arange(_COUNT) * n // _COUNT)
-    # Whole boxes: which points of a box come first would depend on the order of the input.
-    first = np.searchsorted(key, key[begin])
-    last = np.searchsorted(key, key[np.minimum(first + _POINTS, n - 1)])
-    fits = (last - first >= _FEWEST) & (last - first <= 4 * _POINTS)
-    first, count = np.unique(first[fits], return_index=True)
-    count = last[fits][count] - first
-    if len(first) == 0:
+    region = np.repeat(group, grid.holds[leaves])
+    inside = np.flatnonzero(region >= 0)
+    if len(inside) == 0:
         return 0.0
-    ends = np.cumsum(count)
-    index = np.arange(ends[-1]) + np.repeat(first - (ends - count), count)
+    # Whole boxes: which points of a box come first would depend on the order of the input.
+    starts = np.unique(
+        np.searchsorted(key, key[inside[np.arange(_COUNT) * len(inside) // _COUNT]])
+    )
+    ends = np.searchsorted(key, key[np.minimum(starts + _WINDOW * _POINTS, len(key) - 1)])
+    found: dict[tuple[int, int], np.ndarray] = {}
+    for first, last in zip(starts, ends, strict=True):
+        mine = first + np.flatnonzero(region[first:last] == region[first])
+        if len(mine) > _POINTS:
+            mine = mine[: np.searchsorted(key[mine], key[mine[_POINTS - 1]], "right")]
+        if len(mine) >= _FEWEST and region[first] >= 0:
+            found[int(mine[0]), int(mine[-1])] = mine
+    if not found:
+        return 0.0
+    count = np.array([len(mine) for mine in found.values()])
+    begin = np.cumsum(count) - count
+    index = np.concatenate(list(found.values()))
     point = runtime.download(grid.point)[index]
     # In an order that has nothing to do with that of the input.
-    order = np.lexsort((*point.T, np.repeat(np.arange(len(first)), count)))
+    order = np.lexsort((*point.T, np.repeat(np.arange(len(count)), count)))
     point, normal = point[order], runtime.download(grid.normal)[index[order]]
-    fit = fit_all(point, normal, None, np.concatenate([[0], ends]).astype(np.int32))
+    fit = fit_all(point, normal, None, np.append(begin, len(index)).astype(np.int32))
     spare = count[:, None] / (count[:, None] - FREEDOM[None, :])
     rms = np.where(np.isfinite(fit.rms), fit.rms * np.sqrt(spare), np.inf).min(axis=1)
     return float(np.quantile(rms, _CALM))
