@@ -323,9 +323,10 @@ def explain_regions(
     if not params.surfaces.enabled:
         return measured, params, found
     scatter = surface_noise(grid, leaves, found.group[leaves])
-    measured = replace(measured, surface_noise=scatter)
-    if curved and scatter > 0:
-        measured = replace(measured, noise=min(measured.noise, scatter))
+    if scatter is not None:
+        measured = replace(measured, surface_noise=scatter)
+        if curved:
+            measured = replace(measured, noise=min(measured.noise, scatter))
     params = derive(replace(params, surfaces=asked), measured)
     return measured, params, fit_surfaces(grid, leaves, found, params)
 

@@ -3,7 +3,7 @@
 Second differences along a stripe see what two neighbours do not share. What decides whether a point
 lies on a surface is more than that: steps of the range, speckle over several points, views that do
 not quite meet. It is measured where it matters, as the residual of the best analytic surface
-through neighbourhoods of about a hundred points of one region, taken at the calmest quarter of
+through neighbourhoods of about a hundred points of one region, taken at the calmest third of
 them. Where faces are a few neighbourhoods large, nearly all would reach over an edge if regions did
 not keep them apart.
 """
@@ -19,22 +19,25 @@ _COUNT, _POINTS = 256, 128
 _FEWEST = 24
 # The points of a neighbourhood are among so many times as many in Morton order.
 _WINDOW = 4
-_CALM = 0.25
+_CALM = 1.0 / 3.0
 
 
-def surface_noise(grid: Grid, leaves: np.ndarray, group: np.ndarray) -> float:
+def surface_noise(grid: Grid, leaves: np.ndarray, group: np.ndarray) -> float | None:
     """Return the standard deviation of points about the surface through their neighbourhood [mm].
 
     Args:
         grid: The sparse grid: points that follow one another in Morton order are near each other.
         leaves: The nodes that are leaves, in Morton order, shape (C,).
         group: Region of every leaf, -1 = none, shape (C,), i32.
+
+    Returns:
+        The deviation; None where no region is large enough to tell.
     """
     key = runtime.download(grid.key)
     region = np.repeat(group, grid.holds[leaves])
     inside = np.flatnonzero(region >= 0)
     if len(inside) == 0:
-        return 0.0
+        return None
     # Whole boxes: which points of a box come first would depend on the order of the input.
     starts = np.unique(
         np.searchsorted(key, key[inside[np.arange(_COUNT) * len(inside) // _COUNT]])
@@ -48,7 +51,7 @@ def surface_noise(grid: Grid, leaves: np.ndarray, group: np.ndarray) -> float:
         if len(mine) >= _FEWEST and region[first] >= 0:
             found[int(mine[0]), int(mine[-1])] = mine
     if not found:
-        return 0.0
+        return None
     count = np.array([len(mine) for mine in found.values()])
     begin = np.cumsum(count) - count
     index = np.concatenate(list(found.values()))
