@@ -38,7 +38,7 @@ of differences of heights, so errors cancel out faster than independent ones do.
 HOMOGENEITY = (7.0, 0.1, 0.25)
 """Angle between touching cells: this many tolerances, at least and at most so many radians."""
 
-SURFACE_NOISE = (1.3, 0.02)
+SURFACE_NOISE = (1.3, 0.005)
 """A point deviates from its surface by this many standard deviations of the noise, plus so many
 spacings: surfaces are fitted to noisy points, and rounding leaves something on perfect data."""
 TURNS = (0.25, 4.0)
