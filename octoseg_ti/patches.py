@@ -56,8 +56,8 @@ class Regions:
     """`EdgeClass` of every leaf, shape (C,), u8."""
     group: np.ndarray
     """Group of every node that the flood fill reached, -1 = none, shape (M,), i32."""
-    face: np.ndarray
-    """Nodes of flat faces that were cut apart at the bends between them, shape (M,), bool."""
+    cut: np.ndarray
+    """The same with groups of flat faces cut apart at the bends between them, shape (M,), i32."""
     cell_label: np.ndarray
     """Region of every node, 0..K-1, -1 = none, shape (M,), i32."""
     label: np.ndarray
@@ -104,7 +104,7 @@ def grow_regions(
     if literal or not params.regions.assign_edges:
         cell_label = number_groups(grid, group, min_points)
         label = points_of_leaves(grid, leaves, cell_label[leaves])
-        return _regions(touching, edge, group, np.zeros(grid.count, bool), cell_label, label)
+        return _regions(touching, edge, group, group, cell_label, label)
     whole = group
     group = split_at_bends(
         grid,
@@ -125,8 +125,7 @@ def grow_regions(
     # Groups that larger ones explain are no patches: strips along an edge, and bends that are as
     # flat as the face beside them. What is left of them stands for itself.
     group[bend] = flood_fill(grid, touching, bend, **rule)[bend]
-    face = np.isin(whole, whole[bend]) & (whole >= 0) & ~bend
-    grown = group.copy()
+    cut = group.copy()
     number = number_groups(grid, group, min_points)
     doubtful = (strips(grid, touching, group) | bend) & (number >= 0)
     cell_label = np.where(doubtful, NONE, number)
@@ -149,20 +148,20 @@ def grow_regions(
         edge = np.where(edge == int(EdgeClass.NONE), found[leaves], edge)
         cell_label = number_groups(grid, group, min_points)
     label = assign_points(grid, leaves, cell_label, bend=bend, **fit)
-    return _regions(touching, edge, grown, face, cell_label, label)
+    return _regions(touching, edge, whole, cut, cell_label, label)
 
 
 def _regions(
     touching: Adjacency,
     edge: np.ndarray,
     group: np.ndarray,
-    face: np.ndarray,
+    cut: np.ndarray,
     cell_label: np.ndarray,
     label: np.ndarray,
 ) -> Regions:
     count = int(cell_label.max(initial=NONE)) + 1
     return Regions(
-        touching=touching, edge=edge, group=group, face=face, cell_label=cell_label, label=label,
+        touching=touching, edge=edge, group=group, cut=cut, cell_label=cell_label, label=label,
         count=count,
     )  # fmt: skip
 

@@ -45,7 +45,7 @@ from octoseg_ti.stages.merging import (
 )
 from octoseg_ti.types import NONE
 
-_ROUNDS = 3
+_ROUNDS = 2
 # Points of a leaf that speak for it: of all its points, and of those that fit nothing.
 _SAMPLES, _REST = 4, 6
 # A leaf takes part in a new group when so many of its points fit nothing.
@@ -82,9 +82,8 @@ class _Search:
         self.surfaces = no_surfaces()
         self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
         self.choice: Choice | None = None
-        # Leaves of free forms choose nothing; what fits nothing in a flat face is no group.
+        # Leaves of free forms choose nothing, and what fits nothing there is no group of its own.
         self.free = np.zeros(len(leaves), bool)
-        self.face = np.zeros(len(leaves), bool)
 
     @property
     def label(self) -> np.ndarray:
@@ -101,15 +100,14 @@ class _Search:
             self.grid, self.leaves, self.own, table, self.rule, passes=passes, closed=self.free
         )
 
-    def add(
-        self, samples: Samples, sets: list[np.ndarray], whole_only: np.ndarray | None = None
-    ) -> bool:
+    def add(self, samples: Samples, sets: list[np.ndarray], *, apart: bool = True) -> bool:
         """Explain sets of samples; say whether that gave any new surface."""
-        new, label = explain(samples, self.leaves, sets, self.tolerance, whole_only=whole_only)
+        new, label = explain(samples, self.leaves, sets, self.tolerance, apart=apart)
         for members in sets:
             large = samples.weight[members].sum() >= _FREE * self.tolerance.points
-            if large and not np.any(label[members] >= 0):
-                self.free[samples.leaf[members]] = True
+            explained = np.any(label[members] >= 0)
+            if large or explained:
+                self.free[samples.leaf[members]] = not explained
         if len(new) == 0:
             return False
         base = len(self.surfaces)
@@ -149,7 +147,7 @@ class _Search:
         """Return samples of the points that fit nothing, in connected sets."""
         label, leaves = self.label, self.leaves
         left = np.add.reduceat((label < 0).astype(np.int32), leaves.first)
-        there = (left >= _LEFT_POINTS) & ~self.free & ~self.face
+        there = (left >= _LEFT_POINTS) & ~self.free
         both = there[leaves.a] & there[leaves.b]
         root = components(len(leaves), leaves.a[both], leaves.b[both])
         size = np.bincount(root[there], left[there], minlength=len(leaves))
@@ -196,7 +194,7 @@ def find_surfaces(
     grid: Grid,
     leaves: Leaves,
     group: np.ndarray,
-    face: np.ndarray,
+    cut: np.ndarray,
     tolerance: Tolerance,
     rule: Rule,
 ) -> Surfaced:
@@ -206,34 +204,44 @@ def find_surfaces(
         grid: The sparse grid.
         leaves: Its leaves.
         group: Group of every leaf that the flood fill reached, -1 = none, shape (C,), i32.
-        face: Leaves of flat faces that were cut apart at bends, shape (C,), bool: each is one
-            surface or none.
+        cut: The same with groups of flat faces cut apart at the bends between them. It counts where
+            a group is no sum of surfaces: each of its faces may still be one.
         tolerance: What counts as lying on a surface.
         rule: What a point may differ from the surface that it takes.
     """
     search = _Search(grid, leaves, tolerance, rule)
-    search.face = face
     samples = search.samples
-    part = group[samples.leaf]
-    size = np.bincount(group[group >= 0], leaves.count[group >= 0], minlength=1)
-    sets = [
-        s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= tolerance.points
-    ]
-    flat = np.array([face[samples.leaf[s[0]]] for s in sets], bool)
-    for turn in range(_ROUNDS):
-        if not search.add(samples, sets, flat if turn == 0 else None) and turn > 0:
-            break
+    search.add(samples, _sets_of(samples, leaves, group, tolerance.points))
+    if search.free.any():
+        inside = np.where(search.free, cut, NONE)
+        faces = _sets_of(samples, leaves, inside, tolerance.points)
+        search.add(samples, faces, apart=False)
+    for _ in range(_ROUNDS):
         search.choose(passes=2)
         search.refit()
         search.choose()
-        samples, sets = search.rest()
-        if not sets:
+        rest, sets = search.rest()
+        if not sets or not search.add(rest, sets):
             break
+    else:
+        search.choose(passes=2)
     for _ in range(_MERGES):
         merged = search.merge()
         if not search.give_up() and not merged:
             break
     return Surfaced(surfaces=search.surfaces, label=search.label, own=search.own)
+
+
+def _sets_of(
+    samples: Samples, leaves: Leaves, group: np.ndarray, least: float
+) -> list[np.ndarray]:
+    """Return the samples of every group that has enough points."""
+    part = group[samples.leaf]
+    there = group >= 0
+    size = np.bincount(group[there], leaves.count[there], minlength=1)
+    return [
+        s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= least
+    ]
 
 
 def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params) -> Regions:
@@ -252,7 +260,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
     turn = max(TURNS[0], TURNS[1] * tilt)
     rule = Rule(noise, tilt)
     surfaced = find_surfaces(
-        grid, graph, found.group[leaves], found.face[leaves], Tolerance(noise, turn, least), rule
+        grid, graph, found.group[leaves], found.cut[leaves], Tolerance(noise, turn, least), rule
     )
     label, surface = number_pieces(graph, surfaced, least)
     # Regions of which surfaces explain less than half stay; they are free forms.

@@ -4,6 +4,8 @@ All five are surfaces of revolution, so a point is described by its distance ``r
 and its height ``z`` along it, and the surface by a straight line or a circle in that half plane.
 """
 
+from typing import Any
+
 import numpy as np
 
 from octoseg_ti.device import runtime
@@ -16,7 +18,7 @@ SPHERE, TORUS = int(SurfaceKind.SPHERE), int(SurfaceKind.TORUS)
 KINDS = 5
 """Number of analytic kinds; their codes are 0..KINDS - 1."""
 
-vec4 = ti.types.vector(4, ti.f64)
+vec4: Any = ti.types.vector(4, ti.f64)
 
 
 @ti.func

@@ -6,6 +6,7 @@ long as fitting it anew lets it explain more (Besl and Jain 1988), and takes wha
 """
 
 from dataclasses import dataclass
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -17,24 +18,17 @@ from octoseg_ti.device.surfaces import KINDS, evaluate_surfaces, surface_at
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.stages.leaves import Leaves, Samples
 from octoseg_ti.stages.primitives import Fits, fit_all
-from octoseg_ti.types import NONE, SurfaceKind
+from octoseg_ti.stages.selection import choose
+from octoseg_ti.types import NONE
 
-# The simplest surface first.
-_SIMPLEST = (
-    SurfaceKind.PLANE,
-    SurfaceKind.SPHERE,
-    SurfaceKind.CYLINDER,
-    SurfaceKind.CONE,
-    SurfaceKind.TORUS,
-)
-# A simpler surface is taken when its residual is larger by no more than this.
-_SIMPLER = 1.1
 # A surface fits when its residual is below this many noises.
 _FIT = 1.5
 # A sample lies on a surface within this many noises.
 _ON = 3.0
 # A surface explains a set when this share of it lies on it.
 _WHOLE = 0.85
+# ... and for sure when it leaves no more than this many noises there.
+_SURE = 0.9
 # Samples for one fit of a set, and of a growing surface.
 _MANY, _SOME = 200, 150
 # Neighbourhoods of a seed, in samples.
@@ -172,25 +166,6 @@ def spread(members: np.ndarray, most: int) -> np.ndarray:
     return members[(2 * np.arange(most) + 1) * len(members) // (2 * most)]
 
 
-def simplest(rms: np.ndarray, noise: float) -> np.ndarray:
-    """Return the simplest kind whose residual is no worse than the best, or within the noise.
-
-    Args:
-        rms: Residual of every kind [mm], NaN = no such surface, shape (G, 5).
-        noise: Deviation of a point from its surface [mm].
-
-    Returns:
-        `SurfaceKind`, FREE_FORM where no kind fits, shape (G,), i32.
-    """
-    residual = np.where(np.isfinite(rms), rms, np.inf)
-    limit = np.maximum(_SIMPLER * residual.min(axis=1), noise)
-    limit = np.minimum(limit, _FIT * noise)
-    kind = np.full(len(rms), int(SurfaceKind.FREE_FORM), np.int32)
-    for k in reversed(_SIMPLEST):
-        kind[residual[:, k] <= limit] = int(k)
-    return kind
-
-
 def fit_sets(
     samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool = False
 ) -> tuple[np.ndarray, Surfaces]:
@@ -215,9 +190,11 @@ def _fit(samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool
 
 def _simplest_of(fits: Fits, noise: float) -> tuple[np.ndarray, Surfaces]:
     """Return which fits give a surface, and the simplest of each."""
-    kind = simplest(fits.rms, noise)
-    fitted = np.flatnonzero(kind < KINDS)
-    return fitted, Surfaces(kind=kind[fitted], parameters=fits.parameters[fitted, kind[fitted]])
+    chosen = choose(fits, noise=noise, room=_FIT)
+    fitted = np.flatnonzero((chosen.kind >= 0) & (chosen.kind < KINDS))
+    return fitted, Surfaces(
+        kind=chosen.kind[fitted].astype(np.int32), parameters=chosen.parameters[fitted]
+    )
 
 
 def explain(
@@ -226,7 +203,7 @@ def explain(
     sets: list[np.ndarray],
     tolerance: Tolerance,
     *,
-    whole_only: np.ndarray | None = None,
+    apart: bool = True,
 ) -> tuple[Surfaces, np.ndarray]:
     """Find the surfaces that explain sets of samples.
 
@@ -235,7 +212,7 @@ def explain(
         leaves: The leaves.
         sets: Samples that belong together, ascending, an array of indices for every set.
         tolerance: What counts as lying on a surface.
-        whole_only: Sets that are not taken apart, shape (len(sets),), bool; None = no set.
+        apart: Take sets apart that no single surface explains.
 
     Returns:
         The surfaces, and the one that every sample lies on, -1 = none, shape (A,), i32.
@@ -248,20 +225,39 @@ def explain(
     fitted, whole = _simplest_of(fits, noise)
     turn = max(tolerance.turn, 0.5)
     on = lie_on(samples, sets, fitted, whole, (_ON + 0.5) * noise, turn)
+    likely, sure = np.zeros(len(sets), bool), np.zeros(len(sets), bool)
+    for s, there, rms in zip(fitted, on, _rms_on(samples, sets, fitted, whole, on), strict=True):
+        weight = samples.weight[sets[s]]
+        likely[s] = weight[there].sum() >= _WHOLE * weight.sum()
+        sure[s] = likely[s] and rms <= _SURE * noise
+    rest = list(compress(sets, ~sure)) if apart else []
+    more, found = _take_apart(samples, leaves, rest, tolerance)
     kept: list[int] = []
     for m, (s, there) in enumerate(zip(fitted, on, strict=True)):
-        weight = samples.weight[sets[s]]
-        if weight[there].sum() >= _WHOLE * weight.sum():
+        if likely[s] and not np.any(found[sets[s]] >= 0):
             label[sets[s][there]] = len(kept)
             kept.append(m)
-    done = np.zeros(len(sets), bool)
-    done[fitted[kept]] = True
-    if whole_only is not None:
-        done |= whole_only
-    rest = [s for s, d in zip(sets, done, strict=True) if not d]
-    more, found = _take_apart(samples, leaves, rest, tolerance)
     label[found >= 0] = found[found >= 0] + len(kept)
     return whole.at(np.array(kept, np.int64)).joined(more), label
+
+
+def _rms_on(
+    samples: Samples,
+    sets: list[np.ndarray],
+    which: np.ndarray,
+    surfaces: Surfaces,
+    on: list[np.ndarray],
+) -> np.ndarray:
+    """Return the residual of the samples that lie on every surface [mm], shape (M,)."""
+    lying = [sets[s][there] for s, there in zip(which, on, strict=True)]
+    count = np.array([len(i) for i in lying], np.int64)
+    if count.sum() == 0:
+        return np.full(len(count), np.inf)
+    owner = np.repeat(np.arange(len(count)), count)
+    far, _ = evaluate_surfaces(
+        samples.point[np.concatenate(lying)], owner, surfaces.kind, surfaces.parameters
+    )
+    return np.sqrt(np.bincount(owner, far**2, len(count)) / np.maximum(count, 1))
 
 
 def _neighborhoods(point: np.ndarray, seeds: np.ndarray, count: int) -> np.ndarray:

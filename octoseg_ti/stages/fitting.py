@@ -103,13 +103,12 @@ def _linearise(
             v = axis.cross(u)
             u = scale * u
             reach = reach_in[t]
-            first = start_in[g]
             every = every_in[g]
             cost = 0.0
             gradient = vec7(0.0)
             normal = vec28(0.0)
-            for k in range((start_in[g + 1] - first + every - 1) // every):
-                i = first + k * every
+            for k in range((start_in[g + 1] - start_in[g] + every - 1) // every):
+                i = start_in[g] + k * every
                 p = row(point_in, i) - origin
                 local = vec3(p.dot(u), p.dot(v), p.dot(axis))
                 d, j = change_of_distance(kind, local, shape, anchor)

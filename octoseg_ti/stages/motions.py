@@ -12,6 +12,8 @@ the axis, u across the axis towards the points (of a sphere, the axis points to 
 as `profile` reads it.
 """
 
+from typing import Any
+
 import numpy as np
 
 from octoseg_ti.device.linalg import vec3
@@ -47,7 +49,7 @@ STATE = 11
 _TURN = 0.5  # the most that a step turns [rad], opens or bends: derivatives hold no farther
 _GROWTH = 0.75  # the largest relative change of a curvature
 
-vec7 = ti.types.vector(7, ti.f64)
+vec7: Any = ti.types.vector(7, ti.f64)
 
 
 @ti.func

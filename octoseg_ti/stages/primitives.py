@@ -21,7 +21,8 @@ TUKEY = 4.685
 
 _ROUNDS = 12
 _BINS = 64  # of distances: quarters of a power of two, up to the extent of the group
-_NARROWED = 2  # times that every surface takes its own spread for scale, before they share one
+_NARROWED = 6  # most times that surfaces are fitted to the spread that they left, the last together
+_SETTLED = 0.9  # of the spread before: it is not to shrink any more
 _SUMS = 8
 
 
@@ -204,6 +205,7 @@ class _Samples:
         counts = runtime.download(bins)[: tasks * _BINS].reshape(self.groups, KINDS, _BINS)
         below = np.cumsum(counts, axis=-1)
         half = np.argmax(2 * below >= below[..., -1:], axis=-1)
+        half[~np.isfinite(parameters[..., 0])] = _BINS
         return 1.4826 * least[:, None] * 2.0 ** ((half + 0.5) / 4.0)
 
     def sums(self, parameters: np.ndarray, reach: np.ndarray) -> np.ndarray:
@@ -242,7 +244,8 @@ def fit_all(
         weight: Weight of every sample, shape (S,), f64, not negative; None = 1.
         start: First sample of every group, and S at the end, shape (G + 1,), i32.
         noise: Deviation of a point from its surface [mm], of all or of every group, shape (G,):
-            the least scale by which ``robust`` judges a point.
+            the least scale by which ``robust`` judges a point. Give it: a robust fit to exact data
+            may settle on a few points that happen to agree.
         robust: Take the weight from points far off (Tukey's biweight, scale from the median
             distance), so that up to a fifth of the points may belong to something else.
 
@@ -262,20 +265,28 @@ def fit_all(
     samples = _Samples(points, normals, weight, start)
     given = samples.points, samples.weight, start, frame
     reach = np.full((groups, KINDS), np.inf)
-    state = starts(points, normals, weight, start, m)
+    first = starts(points, normals, weight, start, m)
     state, normal = iterate(
-        *given, reach, state, rounds=_ROUNDS, whole=not robust, leave=not robust
+        *given, reach, first, rounds=_ROUNDS, whole=not robust, leave=not robust
     )
     scale = np.broadcast_to(np.asarray(noise, np.float64), groups)[:, None]
-    for narrowed in range(_NARROWED + 1 if robust else 0):
-        spread = samples.spread(to_parameters(state, m.centre, extent), extent)
-        last = narrowed == _NARROWED
+    # Least squares may have followed the outliers to a wrong place: then a start is better.
+    tries = np.concatenate((state[None], first)) if robust else state[None]
+    before, last = np.full((groups, KINDS), np.inf), not robust
+    for narrowed in range(1, _NARROWED + 1):
+        if last:
+            break
+        spreads = [samples.spread(to_parameters(s, m.centre, extent), extent) for s in tries]
+        spread = np.maximum(np.min(spreads, axis=0), scale)
+        last = narrowed == _NARROWED or bool(np.all(spread > _SETTLED * before))
+        before = spread
         if last:
             spread = np.repeat(spread.min(axis=1, keepdims=True), KINDS, axis=1)
-        reach = TUKEY * np.maximum(spread, scale)
+        reach = TUKEY * spread
         state, normal = iterate(
-            *given, reach / extent[:, None], state[None], rounds=_ROUNDS, whole=last, leave=False
+            *given, reach / extent[:, None], tries, rounds=_ROUNDS, whole=last, leave=False
         )
+        tries = state[None]
     parameters = to_parameters(state, m.centre, extent)
     sums = samples.sums(parameters, reach)
     count = np.diff(start)
@@ -323,12 +334,12 @@ def covariance(fits: Fits, kind: np.ndarray) -> np.ndarray:
     deviation = np.nan_to_num(fits.rms[rows, kind]) * np.sqrt(fits.count / count) / fits.extent
     root *= deviation[:, None, None]
     change = np.empty((len(kind), 8, FREE.shape[1]))
+    here = to_parameters(fits.state, fits.centre, fits.extent)
     small = 1e-6
     for k in range(FREE.shape[1]):
         step = np.zeros((len(kind), KINDS, FREE.shape[1]))
         step[..., k] = small
         ahead = to_parameters(moved(fits.state, step), fits.centre, fits.extent)
-        behind = to_parameters(moved(fits.state, -step), fits.centre, fits.extent)
-        change[..., k] = np.nan_to_num((ahead - behind)[rows, kind]) / (2.0 * small)
+        change[..., k] = np.nan_to_num((ahead - here)[rows, kind]) / small
     root = change @ root
     return root @ np.swapaxes(root, 1, 2)

@@ -17,7 +17,7 @@ from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, ti
 from octoseg_ti.device.surfaces import CONE, CYLINDER, KINDS, PLANE, SPHERE, TORUS
 from octoseg_ti.stages.motions import STATE
 
-_DIRECTIONS = 5  # tried as axis
+_DIRECTIONS = 6  # tried as axis
 _FAR = 1e3  # no start is farther from the points than this, in units of their extent
 _LEAST = 1e-2  # the smallest ring to start from, in extents: at none, nothing would move it
 _OTHER = 0.87  # cosine below which a direction is quite another one
@@ -253,11 +253,11 @@ def _axes(m: Moments) -> np.ndarray:
     size = np.trace(m.nn, axis1=1, axis2=2)
     size = np.where(size > 0.0, size, 1.0)[:, None, None]
     centred = m.nn - m.n[:, :, None] * m.n[:, None, :] / size
-    inverse = np.linalg.inv(m.nn + (1e-4 * size) * np.eye(3))
+    inverse = np.linalg.inv(m.nn + (1e-9 * size) * np.eye(3))
     line = m.kk - np.swapaxes(m.nk, 1, 2) @ inverse @ m.nk
     finite = np.nan_to_num(np.stack((m.nn, centred, (line + np.swapaxes(line, 1, 2)) / 2, m.qq)))
     vector = np.linalg.eigh(finite)[1]
-    axis = np.stack((*vector[:, :, :, 0], vector[3, :, :, 2]), axis=1)
+    axis = np.stack((*vector[:, :, :, 0], vector[3, :, :, 1], vector[3, :, :, 2]), axis=1)
     u = across(axis)
     v = np.cross(axis, u)
     basis = np.stack((u, v), axis=-1)  # (G, D, 3, 2)
