@@ -48,8 +48,8 @@ from octoseg_ti.types import NONE
 _ROUNDS = 2
 # Points of a leaf that speak for it: of all its points, and of those that fit nothing.
 _SAMPLES, _REST = 4, 6
-# A leaf takes part in a new group when so many of its points fit nothing.
-_LEFT_POINTS = 2
+# A leaf takes part in a new group when so many of its points fit nothing, or one in so many.
+_LEFT_POINTS, _LEFT_SHARE = 2, 3
 # Samples for fitting a surface anew.
 _REFIT = 300
 # A surface is given up when its neighbours explain its points with this mean square, in noises.
@@ -147,7 +147,7 @@ class _Search:
         """Return samples of the points that fit nothing, in connected sets."""
         label, leaves = self.label, self.leaves
         left = np.add.reduceat((label < 0).astype(np.int32), leaves.first)
-        there = (left >= _LEFT_POINTS) & ~self.free
+        there = ((left >= _LEFT_POINTS) | (_LEFT_SHARE * left >= leaves.count)) & (left > 0) & ~self.free
         both = there[leaves.a] & there[leaves.b]
         root = components(len(leaves), leaves.a[both], leaves.b[both])
         size = np.bincount(root[there], left[there], minlength=len(leaves))
