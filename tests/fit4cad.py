@@ -8,15 +8,15 @@ are CAD parts, sampled without noise or order, with the primitives they are made
 folder of data there is nothing to score, and the command says so.
 
 A primitive is one surface, in however many pieces, and holds all points that lie on it: points of a
-crease belong to several primitives. What was found is the points of a surface, each in one only, so
-that creases alone keep the overlap of small primitives below one. Primitives and surfaces are
-paired one to one, so that the overlaps add up to the most.
+crease belong to several primitives. So do those of what was found (`surface_members`). Members
+and surfaces are paired one to one, so that the overlaps add up to the most.
 
 dice      twice the points in common over the sum of the points, mean over the primitives; a
           primitive without a partner counts 0
 correct   primitives that share 80 % of either's points with their partner
 kinds     of the correct ones, those of the right kind
-shared    dice and correct again, when a point of a crease may be with any of its primitives
+single    dice and correct again, of the labels: every point is of one surface only, so that creases
+          alone keep small primitives from being correct
 """
 
 from __future__ import annotations
@@ -30,20 +30,10 @@ from typing import NamedTuple
 import numpy as np
 
 from octoseg_ti import Segmentation, SurfaceKind, segment
+from octoseg_ti.evaluation.members import Members, surface_members
 
 OVERLAP = 0.8
 """Share of either's points that a primitive and its partner must have in common."""
-
-
-class Primitives(NamedTuple):
-    """The primitives of a cloud; points may belong to several."""
-
-    start: np.ndarray
-    """First entry of every primitive in ``index``, and the number of entries, shape (K + 1,)."""
-    index: np.ndarray
-    """Points of the primitives, one primitive after the other."""
-    kind: np.ndarray
-    """`SurfaceKind` of every primitive, shape (K,)."""
 
 
 class Score(NamedTuple):
@@ -57,57 +47,47 @@ class Score(NamedTuple):
     """The surface that is its partner, -1 = none."""
 
 
-def score(truth: Primitives, label: np.ndarray, *, shared: bool = False) -> Score:
-    """Compare primitives with labels.
-
-    Args:
-        truth: The primitives.
-        label: Surface of every point, -1 = none, shape (N,).
-        shared: A point of several primitives need not be with more than one of them.
-    """
+def score(truth: Members, found: Members) -> Score:
+    """Compare primitives with surfaces; a point may be of several of either."""
     from scipy.optimize import linear_sum_assignment
+    from scipy.sparse import csr_array
 
     count = len(truth.kind)
-    owner = np.repeat(np.arange(count), np.diff(truth.start))
-    mine = label[truth.index]
-    surfaces = int(label.max(initial=-1)) + 1
-    size = np.bincount(label[label >= 0], minlength=surfaces)
-    there = mine >= 0
-    common = np.zeros((count, surfaces))
-    np.add.at(common, (owner[there], mine[there]), 1)
-    members = np.repeat(np.diff(truth.start)[:, None], surfaces, axis=1)
-    if shared:
-        several = np.bincount(truth.index, minlength=len(label))[truth.index] > 1
-        creased = np.zeros((count, surfaces))
-        np.add.at(creased, (owner[there & several], mine[there & several]), 1)
-        # Those of its points of creases that are with another surface do not count.
-        members = members - (creased.sum(axis=1, keepdims=True) - creased)
-    dice = 2.0 * common / (members + size)
+    wide = int(max(truth.index.max(initial=0), found.index.max(initial=0))) + 1
+    tables = [
+        csr_array((np.ones(len(m.index)), m.index, m.start), shape=(len(m.kind), wide))
+        for m in (truth, found)
+    ]
+    common = (tables[0] @ tables[1].T).toarray()
+    members, size = np.diff(truth.start)[:, None], np.diff(found.start)[None, :]
+    dice = 2.0 * common / np.maximum(members + size, 1)
     row, column = linear_sum_assignment(-dice)
     paired = common[row, column] > 0
     row, column = row[paired], column[paired]
     result = Score(np.zeros(count), np.zeros(count, bool), np.full(count, -1))
     result.dice[row], result.partner[row] = dice[row, column], column
     both = common[row, column]
-    result.correct[row] = (both >= OVERLAP * members[row, column]) & (both >= OVERLAP * size[column])
+    result.correct[row] = (both >= OVERLAP * members[row, 0]) & (both >= OVERLAP * size[0, column])
     return result
 
 
-def surface_labels(result: Segmentation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the surface of every point, -1 = none, and the kind of every surface."""
-    label = np.where(result.labels >= 0, np.append(result.surface, -1)[result.labels], -1)
+def labelled(result: Segmentation) -> Members:
+    """Return the points of every surface by their labels: each point is of one surface only."""
     kind = np.full(int(result.surface.max(initial=-1)) + 1, -1)
     kind[result.surface] = result.kind
-    return label, kind
+    label = np.where(result.labels >= 0, np.append(result.surface, -1)[result.labels], -1)
+    order = np.argsort(label, kind="stable")
+    start = np.searchsorted(label[order], np.arange(len(kind) + 1))
+    return Members(start - start[0], order[start[0] :], kind)
 
 
-def read_cloud(path: Path) -> tuple[np.ndarray, Primitives]:
+def read_cloud(path: Path) -> tuple[np.ndarray, Members]:
     """Return the points of a cloud [mm] and its primitives."""
     with np.load(path) as file:
         kind = np.array([int(SurfaceKind[name.upper()]) for name in file["kinds"].tolist()])
         start = file["member_start"]
         start = start if len(start) > len(kind) else np.append(start, len(file["member_index"]))
-        return file["points"].astype(np.float64), Primitives(start, file["member_index"], kind)
+        return file["points"].astype(np.float64), Members(start, file["member_index"], kind)
 
 
 def main() -> None:
@@ -124,7 +104,7 @@ def main() -> None:
     paths = sorted(folder.glob("PC*.npz"), key=lambda p: int(p.stem[2:]))
     rows: dict[str, list[np.ndarray]] = {"even": [], "odd": []}
     head = f"{'points':>7s} {'primitives':>10s} {'found':>6s} {'dice':>6s} {'correct':>8s} "
-    head += f"{'kinds':>6s} {'shared':>7s} {'correct':>8s} {'s':>6s}"
+    head += f"{'kinds':>6s} {'single':>7s} {'correct':>8s} {'s':>6s}"
     print(f"{'cloud':8s}{head}")
     for path in paths:
         half = ("even", "odd")[int(path.stem[2:]) % 2]
@@ -134,25 +114,25 @@ def main() -> None:
         began = time.perf_counter()
         result = segment(points)
         seconds = time.perf_counter() - began
-        label, kind = surface_labels(result)
-        strict, eased = score(truth, label), score(truth, label, shared=True)
-        right = strict.correct & (np.append(kind, -1)[strict.partner] == truth.kind)
+        found, single = surface_members(result), score(truth, labelled(result))
+        all_of = score(truth, found)
+        right = all_of.correct & (np.append(found.kind, -1)[all_of.partner] == truth.kind)
         row = np.array(
-            [len(points), len(truth.kind), len(kind), strict.dice.mean(), strict.correct.sum(),
-             right.sum(), eased.dice.mean(), eased.correct.sum(), seconds]
+            [len(points), len(truth.kind), len(found.kind), all_of.dice.mean(),
+             all_of.correct.sum(), right.sum(), single.dice.mean(), single.correct.sum(), seconds]
         )  # fmt: skip
         rows[half].append(row)
         print(f"{path.stem:8s}{_text(row)}", flush=True)
         if options.missed:
-            for k in np.flatnonzero(~strict.correct):
-                _explain(truth, label, kind, strict, int(k))
+            for k in np.flatnonzero(~all_of.correct):
+                _explain(truth, labelled(result), all_of, int(k), len(points))
     for half, of in rows.items():
         if of:
             table = np.array(of)
             total = table.sum(axis=0)
             total[[3, 6]] /= len(table)
             print(f"{half:8s}{_text(total)}   correct {total[4] / total[1]:.1%}, "
-                  f"shared {total[7] / total[1]:.1%}")  # fmt: skip
+                  f"single {total[7] / total[1]:.1%}")  # fmt: skip
 
 
 def _text(row: np.ndarray) -> str:
@@ -162,22 +142,24 @@ def _text(row: np.ndarray) -> str:
     )
 
 
-def _explain(
-    truth: Primitives, label: np.ndarray, kind: np.ndarray, found: Score, k: int
-) -> None:
+def _explain(truth: Members, found: Members, scores: Score, k: int, count: int) -> None:
     """Print what became of a primitive."""
+    label = np.full(count, len(found.kind))
+    label[found.index] = np.repeat(np.arange(len(found.kind)), np.diff(found.start))
     members = truth.index[truth.start[k] : truth.start[k + 1]]
-    several = np.bincount(truth.index, minlength=len(label))[members] > 1
-    names, count = np.unique(label[members], return_counts=True)
+    several = np.bincount(truth.index, minlength=count)[members] > 1
+    names, shared = np.unique(label[members], return_counts=True)
     parts = []
-    for at in np.argsort(-count)[:5]:
+    for at in np.argsort(-shared)[:5]:
         s = names[at]
-        what = SurfaceKind(int(kind[s])).name.lower() if s >= 0 else "none"
-        whole = np.count_nonzero(label == s)
-        parts.append(f"{count[at]} of {whole} on {what} {s}{'*' if s == found.partner[k] else ''}")
+        what = "nothing"
+        if s < len(found.kind):
+            star = "*" if s == scores.partner[k] else ""
+            what = f"{SurfaceKind(int(found.kind[s])).name.lower()} {s}{star}"
+        parts.append(f"{shared[at]} of {np.count_nonzero(label == s)} on {what}")
     print(
         f"    {SurfaceKind(int(truth.kind[k])).name.lower()} {k}: {len(members)} points, "
-        f"{several.sum()} of creases, dice {found.dice[k]:.3f}: {', '.join(parts)}"
+        f"{several.sum()} of creases, dice {scores.dice[k]:.3f}: {', '.join(parts)}"
     )
 
 
