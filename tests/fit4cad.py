@@ -8,14 +8,14 @@ are CAD parts, sampled without noise or order, with the primitives they are made
 folder of data there is nothing to score, and the command says so.
 
 A primitive is one surface, in however many pieces, and holds all points that lie on it: points of a
-crease belong to several primitives. So do those of what was found (`surface_members`). Members
+crease belong to several primitives. So do those of what was found (`patch_members`). Members
 and surfaces are paired one to one, so that the overlaps add up to the most.
 
 dice      twice the points in common over the sum of the points, mean over the primitives; a
           primitive without a partner counts 0
 correct   primitives that share 80 % of either's points with their partner
 kinds     of the correct ones, those of the right kind
-single    dice and correct again, of the labels: every point is of one surface only, so that creases
+single    dice and correct again, of the labels: every point is of one patch only, so that creases
           alone keep small primitives from being correct
 """
 
@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from octoseg_ti import Segmentation, SurfaceKind, segment
-from octoseg_ti.evaluation.members import Members, surface_members
+from octoseg_ti.evaluation.members import Members, patch_members
 
 OVERLAP = 0.8
 """Share of either's points that a primitive and its partner must have in common."""
@@ -44,11 +44,11 @@ class Score(NamedTuple):
     correct: np.ndarray
     """Shares enough points with its partner, bool."""
     partner: np.ndarray
-    """The surface that is its partner, -1 = none."""
+    """The patch that is its partner, -1 = none."""
 
 
 def score(truth: Members, found: Members) -> Score:
-    """Compare primitives with surfaces; a point may be of several of either."""
+    """Compare primitives with patches; a point may be of several of either."""
     from scipy.optimize import linear_sum_assignment
     from scipy.sparse import csr_array
 
@@ -72,13 +72,10 @@ def score(truth: Members, found: Members) -> Score:
 
 
 def labelled(result: Segmentation) -> Members:
-    """Return the points of every surface by their labels: each point is of one surface only."""
-    kind = np.full(int(result.surface.max(initial=-1)) + 1, -1)
-    kind[result.surface] = result.kind
-    label = np.where(result.labels >= 0, np.append(result.surface, -1)[result.labels], -1)
-    order = np.argsort(label, kind="stable")
-    start = np.searchsorted(label[order], np.arange(len(kind) + 1))
-    return Members(start - start[0], order[start[0] :], kind)
+    """Return the points of every patch by their labels: each point is of one patch only."""
+    order = np.argsort(result.labels, kind="stable")
+    start = np.searchsorted(result.labels[order], np.arange(result.patch_count + 1))
+    return Members(start - start[0], order[start[0] :], result.kind)
 
 
 def read_cloud(path: Path) -> tuple[np.ndarray, Members]:
@@ -114,7 +111,7 @@ def main() -> None:
         began = time.perf_counter()
         result = segment(points)
         seconds = time.perf_counter() - began
-        found, single = surface_members(result), score(truth, labelled(result))
+        found, single = patch_members(result), score(truth, labelled(result))
         all_of = score(truth, found)
         right = all_of.correct & (np.append(found.kind, -1)[all_of.partner] == truth.kind)
         row = np.array(

@@ -1,4 +1,4 @@
-"""All points that lie on each surface: a point of a crease lies on several."""
+"""All points that lie on each patch: a point of a crease lies on several."""
 
 from typing import NamedTuple
 
@@ -8,43 +8,38 @@ from octoseg_ti.defaults import spacing_of
 from octoseg_ti.device.surfaces import KINDS, evaluate_surfaces
 from octoseg_ti.types import Segmentation
 
-# A surface is near a point when it has one of so many nearest points, within so many spacings.
+# A patch is near a point when it has one of so many nearest points, within so many spacings.
 _NEAREST, _SPACINGS = 24, 3.0
 # A point lies on a surface within this many noises.
 _ON = 3.0
 
 
 class Members(NamedTuple):
-    """The points on every surface."""
+    """The points on every one of ``K`` patches; a point may be on several."""
 
     start: np.ndarray
-    """First entry of every surface in ``index``, and the number of entries, shape (M + 1,)."""
+    """First entry of every patch in ``index``, and the number of entries, shape (K + 1,)."""
     index: np.ndarray
-    """Rows of the points, ascending for each surface."""
+    """Rows of the points, patch after patch."""
     kind: np.ndarray
-    """`SurfaceKind` of every surface, shape (M,)."""
+    """`SurfaceKind` of every patch, shape (K,)."""
 
 
-def surface_members(result: Segmentation) -> Members:
-    """Return the points that lie on every surface of a segmentation.
+def patch_members(result: Segmentation) -> Members:
+    """Return the points that lie on every patch of a segmentation.
 
-    Labels give every point to one patch. Here the pieces of a surface are one, and the points of
-    other surfaces that lie on it too, where these meet, are with both.
+    Labels give every point to one patch. Here the points of neighbouring patches that lie on the
+    surface of a patch too, where these meet, are with both.
 
     Args:
         result: A segmentation with analytic surfaces.
-
-    Returns:
-        The points of every surface number of ``result.surface``.
     """
     from scipy.spatial import cKDTree
 
-    count = int(result.surface.max(initial=-1)) + 1
-    kind = np.full(count, -1)
-    parameters = np.zeros((count, 8))
-    kind[result.surface], parameters[result.surface] = result.kind, result.parameters
+    count = result.patch_count
+    analytic = (result.kind >= 0) & (result.kind < KINDS)
     rows = np.flatnonzero(result.labels >= 0)
-    mine = result.surface[result.labels[rows]]
+    mine = result.labels[rows]
     point = result.points[rows]
     noise = result.params.surfaces.noise
     if len(rows) and noise is not None:
@@ -52,14 +47,14 @@ def surface_members(result: Segmentation) -> Members:
         far, near = far.reshape(len(point), -1), near.reshape(len(point), -1)
         reach = _SPACINGS * spacing_of(result.measured)
         name = mine[near]
-        other = (name != mine[:, None]) & (far <= reach) & (kind[name] >= 0) & (kind[name] < KINDS)
+        other = (name != mine[:, None]) & (far <= reach) & analytic[name]
         at, rank = np.nonzero(other)
         pair = np.unique(at * count + name[at, rank])
         at, name = pair // count, pair % count
-        off, _ = evaluate_surfaces(point[at], name, kind, parameters)
+        off, _ = evaluate_surfaces(point[at], name, result.kind, result.parameters)
         on = np.abs(off) <= _ON * noise
         rows = np.concatenate([rows, rows[at[on]]])
         mine = np.concatenate([mine, name[on]])
     order = np.lexsort((rows, mine))
     size = np.bincount(mine, minlength=count)
-    return Members(np.concatenate([[0], np.cumsum(size)]), rows[order], kind)
+    return Members(np.concatenate([[0], np.cumsum(size)]), rows[order], result.kind)
