@@ -41,7 +41,7 @@ HOMOGENEITY = (7.0, 0.1, 0.25)
 SURFACE_NOISE = (1.3, 0.005)
 """A point deviates from its surface by this many standard deviations of the noise, plus so many
 spacings: surfaces are fitted to noisy points, and rounding leaves something on perfect data."""
-TURNS = (0.25, 4.0)
+TURNS = (0.5, 4.0)
 """A sample lies on a surface when its normal is off by no more than this angle [rad], or so many
 deviations of the normals."""
 LEAST_TILT = 0.05

@@ -43,6 +43,9 @@ _LEFT = 0.005
 # more than this many noises, fewer the less they explain: pieces of a free form are cut out as far
 # as they just fit, and leave gaps.
 _COVERED, _REAL = 0.6, 1.15
+# ... and at any rate when they leave no more than this many: what is cut out as far as it just fits
+# leaves half of its reach.
+_EXACT = 0.5
 
 
 class Tolerance(NamedTuple):
@@ -371,25 +374,27 @@ def _take_apart(
             w.on[:, ~w.free[w.scored]] = 0.0
             if w.weight[w.free].sum() < max(_LEFT * w.weight.sum(), tolerance.points):
                 active.remove(s)
-    return _real_ones(samples, sets, found, label, _REAL * noise)
+    return _real_ones(samples, sets, found, label, noise)
 
 
 def _real_ones(
-    samples: Samples, sets: list[np.ndarray], found: Surfaces, label: np.ndarray, limit: float
+    samples: Samples, sets: list[np.ndarray], found: Surfaces, label: np.ndarray, noise: float
 ) -> tuple[Surfaces, np.ndarray]:
     """Drop the surfaces of sets that are free forms."""
     real = np.zeros(len(found) + 1, bool)
     for members in sets:
         name, weight = label[members], samples.weight[members]
         on = name >= 0
-        covered = weight[on].sum() / weight.sum()
-        if covered < _COVERED:
+        if not on.any():
             continue
-        far, _ = evaluate_surfaces(
-            samples.point[members[on]], name[on], found.kind, found.parameters
-        )
-        rms = np.sqrt(np.average(far**2, weights=weight[on]))
-        real[name[on]] = rms <= covered * limit
+        name, weight, total = name[on], weight[on], weight.sum()
+        far, _ = evaluate_surfaces(samples.point[members[on]], name, found.kind, found.parameters)
+        covered = weight.sum() / total
+        rms = np.sqrt(np.average(far**2, weights=weight))
+        real[name] = covered >= _COVERED and rms <= covered * _REAL * noise
+        ids, rank = np.unique(name, return_inverse=True)
+        each = np.sqrt(np.bincount(rank, weight * far**2) / np.bincount(rank, weight))
+        real[ids[each <= _EXACT * noise]] = True
     kept = np.flatnonzero(real[:-1])
     number = np.full(len(real), NONE, np.int32)
     number[kept] = np.arange(len(kept), dtype=np.int32)
