@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from octoseg_ti.defaults import TURNS
 from octoseg_ti.device import runtime
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.params import Params
@@ -253,16 +252,17 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         found: The regions of the flood fill. Those that no analytic surface explains are kept.
         params: Parameters, all filled in.
     """
-    noise, tilt = params.surfaces.noise, params.surfaces.tilt
+    chosen = params.surfaces
+    noise, tilt, turn, fewest = chosen.noise, chosen.tilt, chosen.turn, chosen.min_points
     least = params.regions.min_points
-    assert noise is not None and tilt is not None and least is not None
+    assert noise is not None and tilt is not None and turn is not None
+    assert fewest is not None and least is not None
     graph = leaf_graph(grid, leaves.astype(np.int32), found.touching)
-    turn = max(TURNS[0], TURNS[1] * tilt)
     rule = Rule(noise, tilt)
     surfaced = find_surfaces(
-        grid, graph, found.group[leaves], found.cut[leaves], Tolerance(noise, turn, least), rule
+        grid, graph, found.group[leaves], found.cut[leaves], Tolerance(noise, turn, fewest), rule
     )
-    label, surface = number_pieces(graph, surfaced, least)
+    label, surface = number_pieces(graph, surfaced, least, fewest)
     # Regions of which surfaces explain less than half stay; they are free forms.
     rest = (label < 0) & (found.label >= 0)
     size = np.bincount(found.label[found.label >= 0], minlength=found.count)
@@ -295,13 +295,16 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
     )
 
 
-def number_pieces(leaves: Leaves, found: Surfaced, least: float) -> tuple[np.ndarray, np.ndarray]:
+def number_pieces(
+    leaves: Leaves, found: Surfaced, least: float, fewest: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Number the connected pieces of the surfaces by size.
 
     Args:
         leaves: The leaves.
         found: The surfaces and their points.
-        least: A piece with fewer points is no patch.
+        least: A piece with fewer points is no patch,
+        fewest: unless it is the largest of its surface and has so many.
 
     Returns:
         Patch of every sorted point, -1 = none, shape (n,), i32; and the surface of every patch.
@@ -313,7 +316,11 @@ def number_pieces(leaves: Leaves, found: Surfaced, least: float) -> tuple[np.nda
     rank = (found.own[cell] == name[:, None]).argmax(axis=1)
     mine = piece[cell, rank]
     size = np.bincount(mine)
-    names = np.flatnonzero(size >= max(least, 1))
+    most = np.zeros(len(found.surfaces), np.int64)
+    np.maximum.at(most, name, size[mine])
+    main = np.zeros(len(size), bool)
+    main[mine] = size[mine] == most[name]
+    names = np.flatnonzero(size >= np.where(main, max(fewest, 1), max(least, 1)))
     names = names[np.argsort(-size[names], kind="stable")]
     number = np.full(len(size), NONE, np.int32)
     number[names] = np.arange(len(names), dtype=np.int32)
