@@ -47,6 +47,8 @@ from octoseg_ti.types import NONE
 _ROUNDS = 2
 # Points of a leaf that speak for it: of all its points, and of those that fit nothing.
 _SAMPLES, _REST = 4, 6
+# ... and with the points around those; what these count.
+_AROUND, _HARDLY = 12, 1e-3
 # A leaf takes part in a new group when so many of its points fit nothing, or one in so many.
 _LEFT_POINTS, _LEFT_SHARE = 2, 3
 # Samples for fitting a surface anew.
@@ -142,8 +144,12 @@ class _Search:
         cell = np.nonzero(there)[0]
         self.own = own_lists(self.leaves, cell, name[self.own[there]])
 
-    def rest(self) -> tuple[Samples, list[np.ndarray]]:
-        """Return samples of the points that fit nothing, in connected sets."""
+    def rest(self, *, around: bool = False) -> tuple[Samples, list[np.ndarray]]:
+        """Return samples of the points that fit nothing, in connected sets.
+
+        Points ``around`` them come with them, but hardly count: a narrow face shares most of its
+        points with the faces beside it.
+        """
         label, leaves = self.label, self.leaves
         left = np.add.reduceat((label < 0).astype(np.int32), leaves.first)
         there = ((left >= _LEFT_POINTS) | (_LEFT_SHARE * left >= leaves.count)) & (left > 0) & ~self.free
@@ -151,8 +157,13 @@ class _Search:
         root = components(len(leaves), leaves.a[both], leaves.b[both])
         size = np.bincount(root[there], left[there], minlength=len(leaves))
         kept = there & (size[root] >= self.tolerance.points)
-        blocked = np.where(np.repeat(kept, leaves.count), label, 0).astype(np.int32)
-        samples = sample_leaves(self.grid, leaves, _REST, label=blocked)
+        blocked = np.where(np.repeat(kept, leaves.count), NONE if around else label, 0)
+        samples = sample_leaves(
+            self.grid, leaves, _AROUND if around else _REST, label=blocked.astype(np.int32)
+        )
+        if around:
+            weight = np.where(label[samples.index] < 0, samples.weight, _HARDLY)
+            samples = replace(samples, weight=weight)
         part = root[samples.leaf]
         order = np.argsort(part, kind="stable")
         cut = np.flatnonzero(np.diff(part[order])) + 1
@@ -224,6 +235,11 @@ def find_surfaces(
             break
     else:
         search.choose(passes=2)
+    rest, sets = search.rest(around=True)
+    if sets and search.add(rest, sets):
+        search.choose(passes=2)
+        search.refit()
+        search.choose()
     for _ in range(_MERGES):
         merged = search.merge()
         if not search.give_up() and not merged:

@@ -179,7 +179,7 @@ def fit_sets(
     """
     if not sets:
         return np.zeros(0, np.int64), no_surfaces()
-    return _simplest_of(_fit(samples, sets, noise, robust=robust), noise)
+    return _simplest_of(_fit(samples, sets, noise, robust=robust), noise, samples.signed)
 
 
 def _fit(samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool = False) -> Fits:
@@ -191,9 +191,9 @@ def _fit(samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool
     )
 
 
-def _simplest_of(fits: Fits, noise: float) -> tuple[np.ndarray, Surfaces]:
+def _simplest_of(fits: Fits, noise: float, signed: bool) -> tuple[np.ndarray, Surfaces]:
     """Return which fits give a surface, and the simplest of each."""
-    chosen = choose(fits, noise=noise, room=_FIT)
+    chosen = choose(fits, noise=noise, room=_FIT, signed=signed)
     fitted = np.flatnonzero((chosen.kind >= 0) & (chosen.kind < KINDS))
     return fitted, Surfaces(
         kind=chosen.kind[fitted].astype(np.int32), parameters=chosen.parameters[fitted]
@@ -225,7 +225,7 @@ def explain(
     if not sets:
         return no_surfaces(), label
     fits = _fit(samples, [spread(s, _MANY) for s in sets], noise, robust=True)
-    fitted, whole = _simplest_of(fits, noise)
+    fitted, whole = _simplest_of(fits, noise, samples.signed)
     turn = max(tolerance.turn, 0.5)
     on = lie_on(samples, sets, fitted, whole, (_ON + 0.5) * noise, turn)
     likely, sure = np.zeros(len(sets), bool), np.zeros(len(sets), bool)
@@ -307,14 +307,14 @@ class _Set:
         a, b = inside[leaves.a], inside[leaves.b]
         both = (a >= 0) & (b >= 0)
         self.a, self.b = a[both], b[both]
-        self.total = np.bincount(self.place, minlength=len(self.leaf))
+        self.total = np.bincount(self.place, weights=self.weight, minlength=len(self.leaf))
         self.scored = spread(np.arange(len(members)), _SCORED)
         self.on = np.zeros((0, len(self.scored)), np.float32)
         self.surfaces = no_surfaces()
 
     def connected(self, on: np.ndarray) -> np.ndarray:
         """Return the largest connected part of some members, bool."""
-        share = np.bincount(self.place, weights=on, minlength=len(self.leaf))
+        share = np.bincount(self.place, weights=on * self.weight, minlength=len(self.leaf))
         there = 2 * share >= self.total
         joined = there[self.a] & there[self.b]
         root = components(len(self.leaf), self.a[joined], self.b[joined])
