@@ -49,6 +49,8 @@ _ROUNDS = 2
 _SAMPLES, _REST = 4, 6
 # ... and with the points around those; what these count.
 _AROUND, _HARDLY = 12, 1e-3
+# The normals of narrow faces, and of points at edges, may be off so many times more than others.
+_NARROW = 2.0
 # A leaf takes part in a new group when so many of its points fit nothing, or one in so many.
 _LEFT_POINTS, _LEFT_SHARE = 2, 3
 # Samples for fitting a surface anew.
@@ -101,9 +103,17 @@ class _Search:
             self.grid, self.leaves, self.own, table, self.rule, passes=passes, closed=self.free
         )
 
-    def add(self, samples: Samples, sets: list[np.ndarray], *, apart: bool = True) -> bool:
+    def add(
+        self,
+        samples: Samples,
+        sets: list[np.ndarray],
+        *,
+        apart: bool = True,
+        turn: float | None = None,
+    ) -> bool:
         """Explain sets of samples; say whether that gave any new surface."""
-        new, label = explain(samples, self.leaves, sets, self.tolerance, apart=apart)
+        tolerance = self.tolerance if turn is None else self.tolerance._replace(turn=turn)
+        new, label = explain(samples, self.leaves, sets, tolerance, apart=apart)
         for members in sets:
             large = samples.weight[members].sum() >= _FREE * self.tolerance.points
             explained = np.any(label[members] >= 0)
@@ -152,7 +162,9 @@ class _Search:
         """
         label, leaves = self.label, self.leaves
         left = np.add.reduceat((label < 0).astype(np.int32), leaves.first)
-        there = ((left >= _LEFT_POINTS) | (_LEFT_SHARE * left >= leaves.count)) & (left > 0) & ~self.free
+        there = (left > 0) & ~self.free
+        if not around:
+            there &= (left >= _LEFT_POINTS) | (_LEFT_SHARE * left >= leaves.count)
         both = there[leaves.a] & there[leaves.b]
         root = components(len(leaves), leaves.a[both], leaves.b[both])
         size = np.bincount(root[there], left[there], minlength=len(leaves))
@@ -236,7 +248,8 @@ def find_surfaces(
     else:
         search.choose(passes=2)
     rest, sets = search.rest(around=True)
-    if sets and search.add(rest, sets):
+    # Normals of narrow faces are those of the faces beside them.
+    if sets and search.add(rest, sets, turn=_NARROW * tolerance.turn):
         search.choose(passes=2)
         search.refit()
         search.choose()
@@ -275,6 +288,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
     assert fewest is not None and least is not None
     graph = leaf_graph(grid, leaves.astype(np.int32), found.touching)
     rule = Rule(noise, tilt)
+    rule = rule._replace(turn=max(rule.turn, _NARROW * turn))
     surfaced = find_surfaces(
         grid, graph, found.group[leaves], found.cut[leaves], Tolerance(noise, turn, fewest), rule
     )

@@ -131,7 +131,8 @@ def _choose(
                     angle = 0.0
                 off = ti.abs(d) / rule[0]
                 if angle <= rule[3]:
-                    tilt = ti.min(angle / rule[1], 6.0)
+                    tilt = angle / rule[1]
+                    tilt = ti.min(tilt, 6.0 + 0.1 * ti.max(tilt - 6.0, 0.0))
                     cost = off * off + tilt * tilt
                     if off <= rule[2] and cost < best:
                         next_best = best
