@@ -37,6 +37,7 @@ STAGES = (
 # A cell bends away from its mean plane by 0.13 tolerance times its size at most while its normals
 # are within the tolerance; twice that can only be a step.
 _FLATNESS = 0.25
+_LONGEST = 1e30
 
 
 def segment(
@@ -320,7 +321,9 @@ def explain_regions(
 
     Where the noise was measured against planes, ``curved``, it contains curvature.
     """
-    if not params.surfaces.enabled:
+    extent = grid.size * max(grid.shape)
+    # Fits add up fourth powers of lengths, which beyond this leave the range of numbers.
+    if not params.surfaces.enabled or not 1.0 / _LONGEST < extent < _LONGEST:
         return measured, params, found
     scatter = surface_noise(grid, leaves, found.group[leaves])
     if scatter is not None:

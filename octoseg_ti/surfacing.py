@@ -15,15 +15,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.params import Params
 from octoseg_ti.patches import Regions
-from octoseg_ti.stages.extraction import (
-    Surfaces,
-    Tolerance,
-    explain,
-    fit_sets,
-    lie_on,
-    no_surfaces,
-    spread,
-)
+from octoseg_ti.stages.extraction import Tolerance, explain
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import (
     Choice,
@@ -42,6 +34,7 @@ from octoseg_ti.stages.merging import (
     merge_surfaces,
     pieces,
 )
+from octoseg_ti.stages.sets import Surfaces, fit_sets, lie_on, no_surfaces, spread
 from octoseg_ti.types import NONE
 
 _ROUNDS = 2
@@ -55,9 +48,13 @@ _NARROW = 2.0
 _LEFT_POINTS, _LEFT_SHARE = 2, 3
 # Samples for fitting a surface anew.
 _REFIT = 300
+# ... away from other surfaces, if there are so many of these.
+_INNER = 40
 # A surface is given up when its neighbours explain its points with this mean square, in noises.
 _EXPLAINED = 2.0
 _MERGES = 3
+# By how much the cost of a surface found late must be lower, in squares of noises.
+_HANDICAP = 2.0
 # A free form has at least this many times the points of the smallest patch.
 _FREE = 10.0
 # A point that fits nothing joins a patch within so many times the usual reach.
@@ -85,8 +82,12 @@ class _Search:
         self.surfaces = no_surfaces()
         self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
         self.choice: Choice | None = None
-        # Leaves of free forms choose nothing, and what fits nothing there is no group of its own.
+        # Surfaces found in what others left have to be clearly better where others fit.
+        self.early = 0
+        # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut
+        # out of a group, is no group of its own.
         self.free = np.zeros(len(leaves), bool)
+        self.face = np.zeros(len(leaves), bool)
 
     @property
     def label(self) -> np.ndarray:
@@ -96,9 +97,8 @@ class _Search:
 
     def choose(self, passes: int = 1) -> None:
         """Let the points choose among the surfaces that have points near them."""
-        table = surface_table(
-            self.surfaces.kind, self.surfaces.parameters, np.zeros(len(self.surfaces))
-        )
+        late = np.arange(len(self.surfaces)) >= self.early
+        table = surface_table(self.surfaces.kind, self.surfaces.parameters, _HANDICAP * late)
         self.choice, self.own = label_points(
             self.grid, self.leaves, self.own, table, self.rule, passes=passes, closed=self.free
         )
@@ -119,6 +119,7 @@ class _Search:
             explained = np.any(label[members] >= 0)
             if large or explained:
                 self.free[samples.leaf[members]] = not explained
+                self.face[samples.leaf[members]] |= not apart
         if len(new) == 0:
             return False
         base = len(self.surfaces)
@@ -136,6 +137,14 @@ class _Search:
         """Fit the surfaces anew to the samples that chose them."""
         label = self.label[self.samples.index]
         members = members_of(label, len(self.surfaces))
+        # Points beside other surfaces may belong to these: where there are enough, others count.
+        inner = members_of(
+            np.where(self.inner()[self.samples.leaf], label, NONE), len(self.surfaces)
+        )
+        members = [
+            i if len(i) >= _INNER and 4 * len(i) >= len(m) else m
+            for i, m in zip(inner, members, strict=True)
+        ]
         which = np.array([m for m, s in enumerate(members) if len(s) >= 10], np.int64)
         sets = [spread(members[m], _REFIT) for m in which]
         noise = self.tolerance.noise
@@ -147,6 +156,15 @@ class _Search:
             if new[k].mean() >= old[k].mean() - 0.01:
                 kind[which[f]], parameters[which[f]] = fits.kind[k], fits.parameters[k]
         self.surfaces = Surfaces(kind=kind, parameters=parameters)
+
+    def inner(self) -> np.ndarray:
+        """Return which leaves are full of one surface, as are all that touch them; (C,), bool."""
+        common = common_label(self.leaves, self.label)
+        border = common[self.leaves.a] != common[self.leaves.b]
+        inner = common >= 0
+        inner[self.leaves.a[border]] = False
+        inner[self.leaves.b[border]] = False
+        return inner
 
     def rename(self, name: np.ndarray) -> None:
         """Give surfaces other numbers; -1 gives them up."""
@@ -162,7 +180,7 @@ class _Search:
         """
         label, leaves = self.label, self.leaves
         left = np.add.reduceat((label < 0).astype(np.int32), leaves.first)
-        there = (left > 0) & ~self.free
+        there = (left > 0) & ~self.free & ~self.face
         if not around:
             there &= (left >= _LEFT_POINTS) | (_LEFT_SHARE * left >= leaves.count)
         both = there[leaves.a] & there[leaves.b]
@@ -238,6 +256,7 @@ def find_surfaces(
         inside = np.where(search.free, cut, NONE)
         faces = _sets_of(samples, leaves, inside, tolerance.points)
         search.add(samples, faces, apart=False)
+    search.early = len(search.surfaces)
     for _ in range(_ROUNDS):
         search.choose(passes=2)
         search.refit()
@@ -257,19 +276,17 @@ def find_surfaces(
         merged = search.merge()
         if not search.give_up() and not merged:
             break
+    search.early = len(search.surfaces)
+    search.choose()
     return Surfaced(surfaces=search.surfaces, label=search.label, own=search.own)
 
 
-def _sets_of(
-    samples: Samples, leaves: Leaves, group: np.ndarray, least: float
-) -> list[np.ndarray]:
+def _sets_of(samples: Samples, leaves: Leaves, group: np.ndarray, least: float) -> list[np.ndarray]:
     """Return the samples of every group that has enough points."""
     part = group[samples.leaf]
     there = group >= 0
     size = np.bincount(group[there], leaves.count[there], minlength=1)
-    return [
-        s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= least
-    ]
+    return [s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= least]
 
 
 def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params) -> Regions:
@@ -306,7 +323,6 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         table = surface_table(
             surfaced.surfaces.kind[surface],
             surfaced.surfaces.parameters[surface],
-            np.zeros(len(surface)),
         )
         loose = rule._replace(reach=_LOOSE * rule.reach, turn=float(np.pi))
         own = label_lists(graph, np.where(label < len(surface), label, NONE))

@@ -245,11 +245,7 @@ class Registration:
         """
         moved = (self.refined != self.recorded).any(axis=(1, 2))[:, None, None]
         change = np.where(moved, np.linalg.inv(self.recorded) @ self.refined, np.eye(4))
-        # The sine of a small angle, from the skew part, is exact where the cosine is not.
-        skew = change[:, :3, :3] - change[:, :3, :3].transpose(0, 2, 1)
-        sine = np.linalg.norm(skew, axis=(1, 2)) / np.sqrt(8.0)
-        cosine = (np.trace(change[:, :3, :3], axis1=1, axis2=2) - 1.0) / 2.0
-        return np.linalg.norm(change[:, :3, 3], axis=1), np.arctan2(sine, cosine)
+        return np.linalg.norm(change[:, :3, 3], axis=1), rotation_angle(change)
 
     def __str__(self) -> str:
         """Say in a line what was aligned, and what was not."""
@@ -266,6 +262,17 @@ class Registration:
         if len(loose):
             text += f", not held in every direction: {_listed(loose)}"
         return text
+
+
+def rotation_angle(motion: np.ndarray) -> np.ndarray:
+    """Return by how much rigid motions of shape (..., 4, 4) turn [rad], shape (...)."""
+    turn = motion[..., :3, :3]
+    # The sine of a small angle, from the skew part, is exact where the cosine is not.
+    skew = turn - np.swapaxes(turn, -1, -2)
+    sine = np.linalg.norm(skew, axis=(-2, -1)) / np.sqrt(8.0)
+    cosine = (np.trace(turn, axis1=-2, axis2=-1) - 1.0) / 2.0
+    angle: np.ndarray = np.arctan2(sine, cosine)
+    return angle
 
 
 def _listed(views: np.ndarray) -> str:

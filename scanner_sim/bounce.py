@@ -38,8 +38,7 @@ class _Second(NamedTuple):
 
 
 def add_bounces(
-    target: Target, scanner: StripeScanner, fan: Fan, middle: np.ndarray, rows: np.ndarray,
-    found: Peaks,
+    target: Target, scanner: StripeScanner, fan: Fan, rows: np.ndarray, found: Peaks
 ) -> tuple[Peaks, np.ndarray]:  # fmt: skip
     """Return the peaks as mirrored light changes them, and the artefact of each.
 
@@ -50,7 +49,6 @@ def add_bounces(
         target: The solid.
         scanner: The scanner; ``specular`` is the share that is mirrored.
         fan: The rays.
-        middle: Origin of the view [mm], world, shape (3,).
         rows: Where the rays meet the plane z = 0, evenly spaced [mm], shape (C,).
         found: The peaks without mirrored light.
 
@@ -58,7 +56,7 @@ def add_bounces(
         The peaks in scan order, shape (P',) each; `Artefact.SPIKE`, `Artefact.MULTI_BOUNCE` or
         `Artefact.CLEAN`, shape (P',), u8.
     """
-    second = _second_spots(target, scanner, fan, middle, rows)
+    second = _second_spots(target, scanner, fan, rows)
     mark = np.zeros(len(found.ray), np.uint8)
     if len(second.ray) == 0:
         return found, mark
@@ -112,16 +110,14 @@ def _alone(
     return Peaks(ray, length, position, normal, surface, light, light)
 
 
-def _second_spots(
-    target: Target, scanner: StripeScanner, fan: Fan, middle: np.ndarray, rows: np.ndarray
-) -> _Second:
+def _second_spots(target: Target, scanner: StripeScanner, fan: Fan, rows: np.ndarray) -> _Second:
     """Follow the middle rays over one mirror; return the brightest spot of every detector row."""
     columns = len(fan.ray)
     step = max(_CHUNK // columns, 1)
     pieces = []
     for start in range(0, len(fan.source), step):
         part = fan._replace(source=fan.source[start : start + step])
-        spots = _mirrored(target, scanner, part, middle, rows)
+        spots = _mirrored(target, scanner, part, rows)
         pieces.append(spots._replace(ray=spots.ray + start * columns))
     spots = _Second(*(np.concatenate(column) for column in zip(*pieces, strict=True)))
     order = np.lexsort((-spots.light, spots.ray))  # stable: of equals the first ray's
@@ -130,9 +126,7 @@ def _second_spots(
     return _Second(*(column[order[first]] for column in spots))
 
 
-def _mirrored(
-    target: Target, scanner: StripeScanner, fan: Fan, middle: np.ndarray, rows: np.ndarray
-) -> _Second:
+def _mirrored(target: Target, scanner: StripeScanner, fan: Fan, rows: np.ndarray) -> _Second:
     """Return all mirrored spots of some stripes that the camera can see."""
     columns = len(fan.ray)
     directions = np.tile(fan.ray, (len(fan.source), 1))
@@ -148,13 +142,11 @@ def _mirrored(
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     stripe = met[strong] // columns
     cameras = fan.source[stripe] + fan.rotation @ scanner.camera
-    heights = np.stack([middle, fan.rotation[:, 2]])
     start = position[strong] + target.lift * normal[strong]
-    spots = visible(target, scanner, start, away, cameras, heights)
-    local = (spots.position - middle) @ fan.rotation
-    x = (fan.source[stripe[spots.ray]] - middle) @ fan.rotation[:, 0]
-    depth = scanner.stand_off - local[:, 2]
-    place = project(scanner, depth, local[:, 0] - x)
+    spots = visible(target, scanner, start, away, cameras, fan.rotation[:, 2])
+    local = (spots.position - fan.source[stripe[spots.ray]]) @ fan.rotation
+    depth = -local[:, 2]
+    place = project(scanner, depth, local[:, 0])
     # The row that sees it: where the line from the laser's height meets the plane z = 0.
     pitch = (rows[-1] - rows[0]) / max(len(rows) - 1, 1)
     row = np.rint((local[:, 1] / depth * scanner.stand_off - rows[0]) / max(pitch, 1e-12))

@@ -11,14 +11,12 @@ from octoseg_ti.types import SurfaceKind
 from scanner_sim.crossings import vector
 from scanner_sim.part import FlatPart
 from scanner_sim.quadric import frames
-from scanner_sim.raycast import _solid_if
+from scanner_sim.raycast import side_at, upload_program
 
 _PLANE, _CYLINDER = int(SurfaceKind.PLANE), int(SurfaceKind.CYLINDER)
 _CONE, _SPHERE = int(SurfaceKind.CONE), int(SurfaceKind.SPHERE)
 _HALVINGS = 18  # from a cell's size to some nanometres
-_LEAST_HEIGHT = (
-    0.05  # cones are scaled by their widest place; one as flat as this is still one [mm]
-)
+_LEAST_HEIGHT = 0.05  # cones are scaled by their widest place, this far from the apex or more [mm]
 
 
 class Chart(NamedTuple):
@@ -78,10 +76,7 @@ class Chart(NamedTuple):
         return runtime.download(found)[:count]
 
     def _program(self) -> tuple[object, ...]:
-        part = self.part
-        boxes = part.boxes if len(part.boxes) else np.zeros((1, 6))
-        arrays = (part.code, boxes, part.surfaces.kind, part.surfaces.data, self.axes)
-        return tuple(runtime.upload(array) for array in arrays)
+        return (*upload_program(self.part), runtime.upload(self.axes))
 
 
 def make_chart(part: FlatPart) -> Chart:
@@ -135,17 +130,6 @@ def _point(kinds: ti.template(), data: ti.template(), axes: ti.template(), s, sc
     )  # fmt: skip
 
 
-@ti.func
-def _side(bits):
-    """Return 1 when the solid is inside of the surface, -1 when it is outside, else 0."""
-    result = 0
-    if bits == 1:
-        result = -1
-    elif bits == 2:
-        result = 1
-    return result
-
-
 @ti.kernel
 def _place_points(
     # In:
@@ -169,7 +153,8 @@ def _place_points(
 def _find_sides(
     # In:
     code_in: I32Rows,
-    boxes_in: F64Rows,
+    first_in: I32Array,
+    grid_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
     axes_in: F64Rows,
@@ -182,14 +167,15 @@ def _find_sides(
     for i in range(index_in.shape[0]):
         s = index_in[i]
         p = _point(kinds_in, data_in, axes_in, s, ti.Vector([places_in[i, 0], places_in[i, 1]]))
-        sides_out[i] = _side(_solid_if(code_in, boxes_in, kinds_in, data_in, p, s))
+        sides_out[i] = side_at(code_in, first_in, grid_in, kinds_in, data_in, p, s)
 
 
 @ti.kernel
 def _halve(
     # In:
     code_in: I32Rows,
-    boxes_in: F64Rows,
+    first_in: I32Array,
+    grid_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
     axes_in: F64Rows,
@@ -205,12 +191,11 @@ def _halve(
         low = ti.Vector([inner_in[i, 0], inner_in[i, 1]])
         high = ti.Vector([outer_in[i, 0], outer_in[i, 1]])
         p = _point(kinds_in, data_in, axes_in, s, low)
-        before = _solid_if(code_in, boxes_in, kinds_in, data_in, p, s)
+        before = side_at(code_in, first_in, grid_in, kinds_in, data_in, p, s)
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
             p = _point(kinds_in, data_in, axes_in, s, middle)
-            bits = _solid_if(code_in, boxes_in, kinds_in, data_in, p, s)
-            if _side(bits) == _side(before):
+            if side_at(code_in, first_in, grid_in, kinds_in, data_in, p, s) == before:
                 low = middle
             else:
                 high = middle

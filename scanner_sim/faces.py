@@ -4,13 +4,10 @@ import numpy as np
 
 from octoseg_ti.device import runtime
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
-from octoseg_ti.types import SurfaceKind
-from scanner_sim.crossings import distance, vector
+from scanner_sim.crossings import distance, surface_normal, vector
 from scanner_sim.part import FlatPart
-from scanner_sim.raycast import _solid_if
+from scanner_sim.raycast import side_at, upload_program
 
-_PLANE, _CYLINDER = int(SurfaceKind.PLANE), int(SurfaceKind.CYLINDER)
-_CONE, _SPHERE = int(SurfaceKind.CONE), int(SurfaceKind.SPHERE)
 _STEPS = 4  # places that are tried between two points
 
 
@@ -32,7 +29,7 @@ def goes_on(
     whole = runtime.empty(count, np.int32)
     if count:
         runtime.ensure_started()
-        _walk(*_program(part), *_arrays(surface, first, second), whole)
+        _walk(*upload_program(part), *_arrays(surface, first, second), whole)
         runtime.sync()
     found: np.ndarray = runtime.download(whole)[:count] == 1
     return found
@@ -58,7 +55,7 @@ def side_near(
     sides = runtime.empty(count, np.int32)
     if count:
         runtime.ensure_started()
-        _look_aside(*_program(part), *_arrays(surface, point, run), float(probe), sides)
+        _look_aside(*upload_program(part), *_arrays(surface, point, run), float(probe), sides)
         runtime.sync()
     return runtime.download(sides)[:count]
 
@@ -100,12 +97,6 @@ def passing(
     return near, runtime.download(others)[: first[-1]]
 
 
-def _program(part: FlatPart) -> tuple[object, ...]:
-    boxes = part.boxes if len(part.boxes) else np.zeros((1, 6))
-    arrays = (part.code, boxes, part.surfaces.kind, part.surfaces.data)
-    return tuple(runtime.upload(array) for array in arrays)
-
-
 def _arrays(index: np.ndarray, *rows: np.ndarray) -> tuple[object, ...]:
     return (
         runtime.upload(np.ascontiguousarray(index, np.int32)),
@@ -114,70 +105,37 @@ def _arrays(index: np.ndarray, *rows: np.ndarray) -> tuple[object, ...]:
 
 
 @ti.func
-def _normal(kind, data: ti.template(), s, p):
-    """Return the unit gradient of the distance to surface s."""
-    q = p - vector(data, s, 0)
-    axis = vector(data, s, 3)
-    height = q.dot(axis)
-    result = axis
-    if kind == _SPHERE:
-        result = q / ti.max(q.norm(), 1e-300)
-    elif kind != _PLANE:
-        off = q - height * axis
-        radius = off.norm()
-        off /= ti.max(radius, 1e-300)
-        if kind == _CYLINDER:
-            result = off
-        elif kind == _CONE:
-            result = ti.cos(data[s, 6]) * off - ti.sin(data[s, 6]) * axis
-        else:
-            result = (radius - data[s, 6]) * off + height * axis
-            result /= ti.max(result.norm(), 1e-300)
-    return result
-
-
-@ti.func
 def _onto(kind, data: ti.template(), s, p):
     """Return the place on surface s that is nearest to a place beside it."""
     for _ in ti.static(range(2)):
-        p -= distance(kind, data, s, p) * _normal(kind, data, s, p)
+        p -= distance(kind, data, s, p) * surface_normal(kind, data, s, p)
     return p
-
-
-@ti.func
-def _side(bits):
-    """Return 1 when the solid is inside of the surface, -1 when it is outside, else 0."""
-    result = 0
-    if bits == 1:
-        result = -1
-    elif bits == 2:
-        result = 1
-    return result
 
 
 @ti.kernel
 def _walk(
     # In:
     code_in: I32Rows,
-    boxes_in: F64Rows,
+    first_in: I32Array,
+    grid_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
     index_in: I32Array,
-    first_in: F64Rows,
-    second_in: F64Rows,
+    starts_in: F64Rows,
+    ends_in: F64Rows,
     # Out:
     whole_out: I32Array,
 ):
     """Try places between two points of a face, until one is not on the part."""
     for i in range(index_in.shape[0]):
         s = index_in[i]
-        start, end = vector(first_in, i, 0), vector(second_in, i, 0)
+        start, end = vector(starts_in, i, 0), vector(ends_in, i, 0)
         whole = 1
         for k in range(_STEPS):
             if whole == 1:
                 p = start + (k + 1.0) / (_STEPS + 1.0) * (end - start)
                 p = _onto(kinds_in[s], data_in, s, p)
-                if _side(_solid_if(code_in, boxes_in, kinds_in, data_in, p, s)) == 0:
+                if side_at(code_in, first_in, grid_in, kinds_in, data_in, p, s) == 0:
                     whole = 0
         whole_out[i] = whole
 
@@ -186,7 +144,8 @@ def _walk(
 def _look_aside(
     # In:
     code_in: I32Rows,
-    boxes_in: F64Rows,
+    first_in: I32Array,
+    grid_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
     index_in: I32Array,
@@ -201,12 +160,12 @@ def _look_aside(
         s = index_in[i]
         kind = kinds_in[s]
         p = vector(points_in, i, 0)
-        across = vector(runs_in, i, 0).cross(_normal(kind, data_in, s, p))
+        across = vector(runs_in, i, 0).cross(surface_normal(kind, data_in, s, p))
         side = 0
         for k in range(2):
             if side == 0:
                 there = _onto(kind, data_in, s, p + (2.0 * k - 1.0) * probe * across)
-                side = _side(_solid_if(code_in, boxes_in, kinds_in, data_in, there, s))
+                side = side_at(code_in, first_in, grid_in, kinds_in, data_in, there, s)
         sides_out[i] = side
 
 

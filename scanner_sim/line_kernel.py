@@ -20,7 +20,7 @@ from scanner_sim.line_profile import Fan, Peaks
 from scanner_sim.optics import merging, pixels_per_slope, shine, sub_rays
 from scanner_sim.part import FlatPart
 from scanner_sim.quadric import gradient
-from scanner_sim.raycast import ANY_INTO, FIRST_INTO, nearest_hit
+from scanner_sim.raycast import INTO, nearest_hit, upload_program
 from scanner_sim.scanner import StripeScanner
 from scanner_sim.target import LIFT, CsgTarget
 
@@ -138,10 +138,10 @@ def _follow_rays(
     stop: ti.i32,
     # In:
     code_in: I32Rows,
-    boxes_in: F64Rows,
+    first_in: I32Array,
+    grid_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
-    faces_in: F64Rows,
     sources_in: F64Rows,
     rays_in: F64Rows,
     line_in: F64Rows,
@@ -166,7 +166,7 @@ def _follow_rays(
             hit = vec3(_FAR, -1.0, 0.0)
             if not known:
                 hit = nearest_hit(
-                    code_in, boxes_in, kinds_in, data_in, faces_in, origin, ray, _FAR, FIRST_INTO
+                    code_in, first_in, grid_in, kinds_in, data_in, origin, ray, _FAR, INTO
                 )  # fmt: skip
             elif lit:
                 hit = vec3(0.0, spots_inout[i, middle + 1], spots_inout[i, middle + 2])
@@ -188,10 +188,10 @@ def _look_back(
     stop: ti.i32,
     # In:
     code_in: I32Rows,
-    boxes_in: F64Rows,
+    first_in: I32Array,
+    grid_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
-    faces_in: F64Rows,
     sources_in: F64Rows,
     rays_in: F64Rows,
     line_in: F64Rows,
@@ -212,7 +212,7 @@ def _look_back(
                 far = back.norm()
                 start = place + LIFT * spots_inout[i, k + 2] * normal
                 hit = nearest_hit(
-                    code_in, boxes_in, kinds_in, data_in, faces_in, start, back / far, far, ANY_INTO
+                    code_in, first_in, grid_in, kinds_in, data_in, start, back / far, far, INTO
                 )  # fmt: skip
                 bright = -spots_inout[i, k + 3]
                 spots_inout[i, k + 3] = 0.0 if hit[1] > -0.5 else bright
@@ -281,20 +281,14 @@ def _find_peaks(
                 hit_out[i, n] = ti.i32(spots_in[i, 4 * spot + n])
 
 
-def peaks_of_solid(solid: CsgTarget, scanner: StripeScanner, fan: Fan, middle: np.ndarray) -> Peaks:
+def peaks_of_solid(solid: CsgTarget, scanner: StripeScanner, fan: Fan) -> Peaks:
     """Return the peaks of some stripes; see `scanner_sim.line_profile.peaks`."""
     target = solid.flat
     runtime.ensure_started()
-    del middle  # the planes of the view follow from the fan itself
     offsets, shares = sub_rays(scanner)
     line = runtime.upload(np.column_stack([offsets, shares]))
     optics = _optics(scanner, fan.rotation)
-    boxes = target.boxes if len(target.boxes) else np.zeros((1, 6))
-    faces = target.surface_boxes.reshape(-1, 6)
-    part = [
-        runtime.upload(np.ascontiguousarray(a))
-        for a in (target.code, boxes, target.surfaces.kind, target.surfaces.data, faces)
-    ]
+    part = upload_program(target)
     ray = runtime.upload(fan.ray)
     columns = len(fan.ray)
     step = max(_CHUNK // columns, 1)

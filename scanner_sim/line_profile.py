@@ -1,7 +1,7 @@
 """What the camera sees of the laser line: one peak a detector row, from the rays over its width.
 
 `peaks` is the plain road, ray by ray in NumPy, for any target; `scanner_sim.line_kernel` does the
-same for solids in one kernel. A row's profile is the light of all rays over the line's width that
+same for solids in kernels. A row's profile is the light of all rays over the line's width that
 laser and camera both reach. The peak is the centroid of the brightest group of spots that touch
 each other on the detector, and is triangulated as if it lay in the middle of the laser plane: so
 edges get round, points appear between the two sides of a step, and shadows end a little off.
@@ -70,7 +70,7 @@ def visible(
     origins: np.ndarray,
     directions: np.ndarray,
     cameras: np.ndarray,
-    heights: np.ndarray,
+    up: np.ndarray,
 ) -> Spots:
     """Return where rays first meet the part, if that is within all limits and the camera sees it.
 
@@ -80,7 +80,7 @@ def visible(
         origins: Where rays start [mm], world, shape (N, 3).
         directions: Unit vectors, shape (N, 3).
         cameras: Position of the camera of every ray [mm], world, shape (N, 3).
-        heights: Plane z = 0 of the view, as (a point [mm], the unit z axis), shape (2, 3).
+        up: z axis of the view, world, shape (3,).
     """
     hits = target.trace(origins, directions, np.full(len(origins), math.inf))
     found = np.flatnonzero(hits.surface >= 0)
@@ -88,12 +88,12 @@ def visible(
     position = origins[found] + hits.distance[found, None] * sight
     normal = hits.normal[found]
     to_camera = cameras[found] - position
+    height = scanner.stand_off - to_camera @ up  # the camera is as high as the laser
     far = np.linalg.norm(to_camera, axis=1)
     to_camera /= far[:, None]
     seen = -np.einsum("ij,ij->i", normal, sight) >= math.cos(scanner.incidence_limit)
     seen &= np.einsum("ij,ij->i", normal, to_camera) >= math.cos(scanner.camera_limit)
     if scanner.depth_of_field is not None:
-        height = (position - heights[0]) @ heights[1]
         seen &= np.abs(height) <= scanner.depth_of_field / 2
     open_ = np.flatnonzero(seen)
     chosen = open_[~target.hidden(position[open_], normal[open_], to_camera[open_], far[open_])]
@@ -103,28 +103,22 @@ def visible(
     )  # fmt: skip
 
 
-def peaks(target: Target, scanner: StripeScanner, fan: Fan, middle: np.ndarray) -> Peaks:
+def peaks(target: Target, scanner: StripeScanner, fan: Fan) -> Peaks:
     """Return the peaks of some stripes.
 
     Args:
         target: The solid.
         scanner: The scanner.
         fan: The rays.
-        middle: Origin of the view [mm], world, shape (3,).
     """
     offsets, shares = sub_rays(scanner)
     origins = np.repeat(fan.source, len(fan.ray), axis=0)
     directions = np.tile(fan.ray, (len(fan.source), 1))
-    cameras = (
-        np.repeat((fan.source - middle) @ fan.rotation + scanner.camera, len(fan.ray), axis=0)
-        @ fan.rotation.T
-        + middle
-    )
-    heights = np.stack([middle, fan.rotation[:, 2]])
-    across = fan.rotation[:, 0]
+    cameras = origins + fan.rotation @ scanner.camera
+    across, up = fan.rotation[:, 0], fan.rotation[:, 2]
     spots = [
         visible(target, scanner, origins + offset * across if offset else origins, directions,
-                cameras, heights)
+                cameras, up)
         for offset in offsets
     ]  # fmt: skip
     light = [brightness(scanner, directions[s.ray], s.normal, s.to_camera) for s in spots]

@@ -11,8 +11,8 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import reduce
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from functools import cached_property, reduce
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -23,11 +23,11 @@ from scanner_sim.quadric import Surface, Surfaces, canonical, pack
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from scanner_sim.cubes import Cubes
     from scanner_sim.scanner import View
 
     Triple: TypeAlias = Sequence[float] | np.ndarray
 
-_PAD = 1e-5  # boxes are this much too large [mm]: rounding never loses a face on their border
 _MAX_DEPTH = 30  # the stack of two-bit values lives in one 64-bit word
 
 
@@ -35,30 +35,34 @@ class Op(IntEnum):
     """Instructions of the stack machine."""
 
     LEAF = 0
-    """Push the side of surface ``arg``; bit 0 of ``jump`` exchanges inside and outside, bit 1 says
-    that differences around it do so once more."""
+    """Push whether a point is inside of surface ``arg``; outside of it where ``flag`` is 1."""
     UNION = 1
+    """Put one value in place of two."""
     INTERSECTION = 2
+    """Put one value in place of two."""
     DIFFERENCE = 3
-    BOX = 4
-    """Outside of box ``arg``: push false and continue at ``jump``."""
-    SKIP_FALSE = 5
-    """Continue at ``jump`` when the top is false."""
-    SKIP_TRUE = 6
-    """Continue at ``jump`` when the top is true."""
+    """Of trees alone: programs intersect with what is turned inside out, surface by surface."""
 
 
-class FlatPart(NamedTuple):
-    """A part as arrays; ``M`` instructions, ``B`` boxes, ``S`` surfaces."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FlatPart:
+    """A part as arrays; ``M`` instructions, ``S`` surfaces."""
 
+    box: np.ndarray
+    """Box around the part [mm], shape (2, 3), f64."""
     code: np.ndarray
-    """Instructions (`Op`, arg, jump), shape (M, 3), i32."""
-    boxes: np.ndarray
-    """Lower and upper corner [mm], shape (B, 6), f64."""
+    """Instructions (`Op`, arg, flag), shape (M, 3), i32."""
     surfaces: Surfaces
     """The surfaces, each once."""
     surface_boxes: np.ndarray
     """Box around all faces on each surface [mm], shape (S, 2, 3), f64."""
+
+    @cached_property
+    def cubes(self) -> Cubes:
+        """What is left of the program in each of many cubes: what kernels walk."""
+        from scanner_sim.cubes import divide
+
+        return divide(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -260,51 +264,38 @@ class _Flattener:
     """Writes the program of one part."""
 
     def __init__(self) -> None:
-        self.code: list[list[int]] = []
-        self.boxes: list[np.ndarray] = []
+        self.code: list[tuple[int, int, int]] = []
         self.surfaces: dict[tuple[object, ...], int] = {}
         self.forms: list[Surface] = []
         self.surface_boxes: list[np.ndarray] = []
 
     def run(self, part: Part) -> FlatPart:
-        self._write(part, part.box, None, 1, False)
+        self._write(part, part.box, 1, False)
         return FlatPart(
+            box=part.box,
             code=np.array(self.code, np.int32),
-            boxes=np.array(self.boxes, np.float64).reshape(-1, 6),
             surfaces=pack(self.forms),
             surface_boxes=np.array(self.surface_boxes),
         )
 
-    def _write(
-        self, part: Part, limits: np.ndarray, tested: np.ndarray | None, depth: int, cut: bool
-    ) -> None:
+    def _write(self, part: Part, limits: np.ndarray, depth: int, away: bool) -> None:
+        """Write the program of a part, or of what is not in it where it is taken away."""
         if depth > _MAX_DEPTH:
             raise DataError(f"a part may be nested {_MAX_DEPTH} operations deep, not more")
         # Nothing outside of the limits matters, so they also bound what is cut away.
         own = _meet(part.box, limits)
         if part.surface is not None:
-            self._write_leaf(part, own, cut)
+            self._write_leaf(part, own, away)
             return
-        guard = None
-        if np.isfinite(own).all() and (tested is None or not np.array_equal(own, tested)):
-            guard = len(self.code)
-            self.code.append([Op.BOX, len(self.boxes), 0])
-            self.boxes.append(np.concatenate([own[0] - _PAD, own[1] + _PAD]))
-            tested = own
-        skips = []
+        # What is not in a union is in none of its solids, and so on.
+        union = (part.operation == Op.UNION) != away
         for k, child in enumerate(part.children):
-            away = k > 0 and part.operation == Op.DIFFERENCE
-            self._write(child, own, tested, depth + 1, cut != away)
+            cut = k > 0 and part.operation == Op.DIFFERENCE
+            self._write(child, own, depth + 1, away != cut)
             if k > 0:
-                self.code.append([part.operation, 0, 0])
-            if k + 1 < len(part.children):
-                skips.append(len(self.code))
-                skip = Op.SKIP_TRUE if part.operation == Op.UNION else Op.SKIP_FALSE
-                self.code.append([skip, 0, 0])
-        for place in [*skips, *([] if guard is None else [guard])]:
-            self.code[place][2] = len(self.code)
+                self.code.append((Op.UNION if union else Op.INTERSECTION, 0, 0))
 
-    def _write_leaf(self, part: Part, limits: np.ndarray, cut: bool) -> None:
+    def _write_leaf(self, part: Part, limits: np.ndarray, away: bool) -> None:
         assert part.surface is not None
         form, flipped = canonical(part.surface)
         number = self.surfaces.setdefault(form.key(), len(self.forms))
@@ -315,4 +306,4 @@ class _Flattener:
             known = self.surface_boxes[number]
             known[0] = np.minimum(known[0], limits[0])
             known[1] = np.maximum(known[1], limits[1])
-        self.code.append([Op.LEAF, number, int(part.outside != flipped) | int(cut) << 1])
+        self.code.append((Op.LEAF, number, int((part.outside != flipped) != away)))

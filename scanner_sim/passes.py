@@ -105,10 +105,10 @@ def scan_pass(
     nominal = _sources(x, scanner, view, middle)
     off = stage_error(scanner, x, stream(*seeds, Stream.JITTER), stream(*seeds, Stream.PERIOD))
     fan = Fan(_sources(x + off, scanner, view, middle), ray @ rotation.T, rotation)
-    found = _peaks(target, scanner, fan, middle)
+    found = _peaks(target, scanner, fan)
     mark = np.zeros(len(found.ray), np.uint8)
     if scanner.specular > 0.0:
-        found, mark = add_bounces(target, scanner, fan, middle, y, found)
+        found, mark = add_bounces(target, scanner, fan, y, found)
     if scanner.threshold > 0.0:
         bright = found.light >= scanner.threshold
         found, mark = Peaks(*(column[bright] for column in found)), mark[bright]
@@ -141,16 +141,16 @@ def _sources(x: np.ndarray, scanner: StripeScanner, view: View, middle: np.ndarr
     return world
 
 
-def _peaks(target: Target, scanner: StripeScanner, fan: Fan, middle: np.ndarray) -> Peaks:
+def _peaks(target: Target, scanner: StripeScanner, fan: Fan) -> Peaks:
     """Return the peaks of all stripes, in bounded memory."""
     if scanner.effects and isinstance(target, CsgTarget):
-        return peaks_of_solid(target, scanner, fan, middle)
+        return peaks_of_solid(target, scanner, fan)
     columns = len(fan.ray)
     step = max(_CHUNK // columns, 1)
     pieces = []
     for start in range(0, len(fan.source), step):
         part = fan._replace(source=fan.source[start : start + step])
-        found = peaks(target, scanner, part, middle)
+        found = peaks(target, scanner, part)
         pieces.append(found._replace(ray=found.ray + start * columns))
     return Peaks(*(np.concatenate(column) for column in zip(*pieces, strict=True)))
 

@@ -29,11 +29,13 @@ def pose_errors(count: int, noise: float, angle: float, seed: int) -> np.ndarray
     Returns:
         Motions in the frames of the views, shape (count, 4, 4), f64.
     """
+    from scipy.spatial.transform import Rotation
+
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_CHILD,)))
     drawn = generator.standard_normal((count, 6))
     drawn[:1] = 0.0
     motions = np.tile(np.eye(4), (count, 1, 1))
-    motions[:, :3, :3] = _rotations(angle * drawn[:, :3])
+    motions[:, :3, :3] = Rotation.from_rotvec(angle * drawn[:, :3]).as_matrix()
     motions[:, :3, 3] = noise * drawn[:, 3:]
     return motions
 
@@ -60,15 +62,3 @@ def as_recorded(points: np.ndarray, true: np.ndarray, recorded: np.ndarray) -> n
     shift = recorded @ np.linalg.inv(true)
     moved: np.ndarray = np.einsum("ij,nj->ni", shift[:3, :3], points) + shift[:3, 3]
     return moved
-
-
-def _rotations(vectors: np.ndarray) -> np.ndarray:
-    """Return the rotations of rotation vectors [rad] by Rodrigues' formula, shape (V, 3, 3)."""
-    angle = np.linalg.norm(vectors, axis=1)
-    axis = vectors / np.where(angle > 0.0, angle, 1.0)[:, None]
-    cross = np.zeros((len(vectors), 3, 3))
-    cross[:, [2, 0, 1], [1, 2, 0]] = axis
-    cross[:, [1, 2, 0], [2, 0, 1]] = -axis
-    s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    rotations: np.ndarray = np.eye(3) + s * cross + (1.0 - c) * (cross @ cross)
-    return rotations

@@ -1,8 +1,10 @@
 """Rays against parts, in parallel: the nearest hit, what hides a point, and where a face ends.
 
+Rays go from cube to cube (`scanner_sim.cubes`) and end at the first hit.
+
 A point of a surface lies on the solid exactly when being inside or outside of that one surface
-decides whether the point is solid. So each value on the stack of the part's program has two
-bits: the answer if the point were outside of the surface (bit 0), and if it were inside (bit 1).
+decides whether the point is solid. So each value on the stack of a program has two bits: the
+answer if the point were outside of the surface (bit 0), and if it were inside (bit 1).
 """
 
 import math
@@ -12,16 +14,16 @@ import numpy as np
 
 from octoseg_ti.device import runtime
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, ti
+from octoseg_ti.types import SurfaceKind
 from scanner_sim.crossings import FAR, crossings, distance, surface_normal, vector
 from scanner_sim.part import FlatPart, Op
 
-_LEAF, _UNION, _INTERSECTION = int(Op.LEAF), int(Op.UNION), int(Op.INTERSECTION)
-_DIFFERENCE, _BOX = int(Op.DIFFERENCE), int(Op.BOX)
-_SKIP_FALSE, _SKIP_TRUE = int(Op.SKIP_FALSE), int(Op.SKIP_TRUE)
+_LEAF, _UNION = int(Op.LEAF), int(Op.UNION)
+_TORUS = int(SurfaceKind.TORUS)
+_STEPS = 12  # after so many a torus is taken to be near
 _NEAR = 1e-9  # a hit closer to the origin of its ray than this is the origin itself [mm]
-_ANY, _INTO = 1, 2  # modes of a ray: any hit will do; only ways into the solid count
-FIRST_INTO, ANY_INTO = _INTO, _ANY + _INTO
-_SLACK = 1e-5  # a hit may be this far outside of the box around the faces of its surface [mm]
+INTO = 1  # mode of a ray: only ways into the solid count
+_SLACK = 1e-5  # a hit may be this far outside of the cube of the ray [mm]
 
 
 class Hits(NamedTuple):
@@ -42,7 +44,6 @@ def cast(
     directions: np.ndarray,
     reach: np.ndarray,
     *,
-    any_hit: bool = False,
     from_outside: bool = False,
 ) -> Hits:
     """Follow rays to the first surface of the solid.
@@ -52,7 +53,6 @@ def cast(
         origins: Starting points [mm], shape (N, 3).
         directions: Unit vectors, shape (N, 3).
         reach: Length of every ray [mm], shape (N,); hits beyond it do not count.
-        any_hit: Stop at any hit within reach, not the nearest one: enough to know what is hidden.
         from_outside: Every ray begins outside of the solid. Then only the ways into it are looked
             at, which is faster.
 
@@ -68,10 +68,8 @@ def cast(
     surfaces = runtime.empty(count, np.int32)
     sides = runtime.empty(count, np.int32)
     _cast_rays(
-        runtime.upload(part.code), _boxes(part), runtime.upload(part.surfaces.kind),
-        runtime.upload(part.surfaces.data), _rows(part.surface_boxes.reshape(-1, 6)),
-        _rows(origins), _rows(directions), runtime.upload(limits),
-        _ANY * int(any_hit) + _INTO * int(from_outside),
+        *upload_program(part), _rows(origins), _rows(directions), runtime.upload(limits),
+        INTO * int(from_outside),
         distances, surfaces, sides,
     )  # fmt: skip
     runtime.sync()
@@ -98,75 +96,94 @@ def classify(part: FlatPart, points: np.ndarray, surface: np.ndarray) -> np.ndar
         return np.empty(0, np.int32)
     sides = runtime.empty(count, np.int32)
     _classify_points(
-        runtime.upload(part.code), _boxes(part), runtime.upload(part.surfaces.kind),
-        runtime.upload(part.surfaces.data), _rows(points),
-        runtime.upload(np.asarray(surface, np.int32)), sides,
-    )  # fmt: skip
+        *upload_program(part), _rows(points), runtime.upload(np.asarray(surface, np.int32)), sides
+    )
     runtime.sync()
     return runtime.download(sides)[:count]
+
+
+def upload_program(part: FlatPart) -> tuple[object, ...]:
+    """Return a part for kernels: the three arrays of its cells, kinds and data of its surfaces."""
+    arrays = (*part.cubes, part.surfaces.kind, part.surfaces.data)
+    return tuple(runtime.upload(array) for array in arrays)
 
 
 def _rows(values: np.ndarray) -> object:
     return runtime.upload(np.ascontiguousarray(values, np.float64))
 
 
-def _boxes(part: FlatPart) -> object:
-    return runtime.upload(part.boxes if len(part.boxes) else np.zeros((1, 6)))
-
-
 @ti.func
-def _solid_if(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
-              data: ti.template(), p, surface):  # fmt: skip
-    """Return two bits: is p solid if it is outside (bit 0) or inside (bit 1) of the surface?"""
+def _side_within(code: ti.template(), start, stop, kinds: ti.template(), data: ti.template(),
+                 p, surface):  # fmt: skip
+    """Return on which side of a surface the solid lies, by some instructions; 0 = on none."""
     stack = ti.i64(0)
-    pc = 0
-    while pc < code.shape[0]:
-        op = code[pc, 0]
-        arg = code[pc, 1]
-        jump = code[pc, 2]
-        pc += 1
+    for i in range(start, stop):
+        op, arg, flag = code[i, 0], code[i, 1], code[i, 2]
         if op == _LEAF:
             value = ti.i64(2)
             if arg != surface:
                 value = ti.i64(3) if distance(kinds[arg], data, arg, p) <= 0.0 else ti.i64(0)
-            if (jump & 1) == 1:
+            if flag == 1:
                 value = value ^ 3
             stack = (stack << 2) | value
-        elif op == _BOX:
-            hit = True
-            for k in ti.static(range(3)):
-                if p[k] < boxes[arg, k] or p[k] > boxes[arg, k + 3]:
-                    hit = False
-            if not hit:
-                stack = stack << 2
-                pc = jump
-        elif op == _SKIP_FALSE:
-            if (stack & 3) == 0:
-                pc = jump
-        elif op == _SKIP_TRUE:
-            if (stack & 3) == 3:
-                pc = jump
         else:
             upper = stack & 3
             stack = stack >> 2
-            lower = stack & 3
-            value = lower & upper
+            value = stack & upper
             if op == _UNION:
-                value = lower | upper
-            elif op == _DIFFERENCE:
-                value = lower & (upper ^ 3)
-            stack = ((stack >> 2) << 2) | value
-    return ti.i32(stack & 3)
+                value = stack | upper
+            stack = ((stack >> 2) << 2) | (value & 3)
+    result = 0
+    bits = stack & 3
+    if bits == 1:
+        result = -1
+    elif bits == 2:
+        result = 1
+    return result
 
 
 @ti.func
-def _meets_box(boxes: ti.template(), b, origin, direction, inverse, reach, slack):
-    """Say whether a ray meets box b, made larger by a slack, within its reach."""
+def _cube_of(grid: ti.template(), p):
+    """Return which cube a place is in, or the nearest one to it, as three numbers."""
+    cube = ti.Vector([0, 0, 0])
+    for k in ti.static(range(3)):
+        place = ti.i32((p[k] - grid[0, k]) / grid[1, k])
+        cube[k] = ti.max(0, ti.min(place, ti.i32(grid[2, k]) - 1))
+    return cube
+
+
+@ti.func
+def _number(grid: ti.template(), cube):
+    """Return the number of a cube."""
+    return (cube[0] * ti.i32(grid[2, 1]) + cube[1]) * ti.i32(grid[2, 2]) + cube[2]
+
+
+@ti.func
+def side_at(code: ti.template(), first: ti.template(), grid: ti.template(),
+            kinds: ti.template(), data: ti.template(), p, surface):  # fmt: skip
+    """Return on which side of a surface, at a place on it, the solid lies.
+
+    1 where it is inside of the surface, -1 where it is outside, 0 where neither or both are.
+    """
+    within = True
+    for k in ti.static(range(3)):
+        if p[k] < grid[0, k] or p[k] > grid[0, k] + grid[1, k] * grid[2, k]:
+            within = False
+    result = 0
+    if within:
+        c = _number(grid, _cube_of(grid, p))
+        result = _side_within(code, first[c], first[c + 1], kinds, data, p, surface)
+    return result
+
+
+@ti.func
+def _span(grid: ti.template(), origin, direction, inverse, reach):
+    """Return where a ray enters the cubes and where it leaves them; before that, if nowhere."""
     enter = 0.0
     leave = reach
     for k in ti.static(range(3)):
-        low = boxes[b, k] - slack
-        high = boxes[b, k + 3] + slack
+        low = grid[0, k]
+        high = low + grid[1, k] * grid[2, k]
         first = (low - origin[k]) * inverse[k]
         second = (high - origin[k]) * inverse[k]
         if direction[k] == 0.0:  # parallel to these sides: between them for ever, or never
@@ -175,73 +192,124 @@ def _meets_box(boxes: ti.template(), b, origin, direction, inverse, reach, slack
             second = FAR
         enter = ti.max(enter, ti.min(first, second))
         leave = ti.min(leave, ti.max(first, second))
-    return enter <= leave
+    return ti.Vector([enter, leave])
 
 
 @ti.func
-def _in_box(boxes: ti.template(), b, p):
-    """Say whether a place is in box b, or as good as in it."""
-    inside = True
-    for k in ti.static(range(3)):
-        if p[k] < boxes[b, k] - _SLACK or p[k] > boxes[b, k + 3] + _SLACK:
-            inside = False
-    return inside
+def _may_cross(kind, data: ti.template(), s, origin, direction, low, high):
+    """Say whether a ray may cross surface s between two distances.
 
-
-@ti.func
-def nearest_hit(code: ti.template(), boxes: ti.template(), kinds: ti.template(),
-                data: ti.template(), faces: ti.template(),
-                origin, direction, reach, mode):  # fmt: skip
-    """Return (distance, surface or -1, side) of a ray's nearest hit, or of any within reach.
-
-    The part's program is walked once; every crossing that is nearer than the best hit is tested.
-    The mode says whether any hit will do, and whether only ways into the solid are looked at: a
-    surface knows which of its sides is solid wherever it bounds the part.
+    Only a torus costs more to cross than to ask: by steps as long as the surface is far away.
     """
-    best = reach
+    t = low
+    if kind == _TORUS:
+        steps = 0
+        gap = 1.0
+        while steps < _STEPS and t < high and gap > _SLACK:
+            gap = ti.abs(distance(kind, data, s, origin + t * direction))
+            t += gap
+            steps += 1
+    return t <= high
+
+
+@ti.func
+def _nearest_within(code: ti.template(), start, stop, kinds: ti.template(), data: ti.template(),
+                    origin, direction, low, high, mode):  # fmt: skip
+    """Return (distance, surface or -1, side) of the nearest hit between two distances.
+
+    Every crossing that is nearer than the best hit is tested by the same instructions.
+    """
+    best = high
     surface = -1
     side = 0
-    inverse = 1.0 / direction
-    pc = 0
-    while pc < code.shape[0] and not ((mode & _ANY) != 0 and surface >= 0):
-        op = code[pc, 0]
-        arg = code[pc, 1]
-        jump = code[pc, 2]
-        pc += 1
-        if op == _BOX:
-            if not _meets_box(boxes, arg, origin, direction, inverse, best, 0.0):
-                pc = jump
-        elif op == _LEAF:
-            # Nested, because `and` looks at both sides. A surface is asked where its faces can be,
-            # and the whole part only about crossings that are there.
-            if _meets_box(faces, arg, origin, direction, inverse, best, _SLACK):
+    for i in range(start, stop):
+        if code[i, 0] == _LEAF:
+            arg = code[i, 1]
+            found = ti.Vector([FAR, FAR, FAR, FAR])
+            if _may_cross(kinds[arg], data, arg, origin, direction, low, best):
                 found = crossings(kinds[arg], data, arg, origin, direction)
-                for k in range(4):
-                    t = found[k]
-                    if _NEAR < t < best:
-                        p = origin + t * direction
-                        asked = _in_box(faces, arg, p)
-                        if asked and (mode & _INTO) != 0:
-                            outside = (jump ^ (jump >> 1)) & 1  # the outside of it is solid
-                            slope = surface_normal(kinds[arg], data, arg, p).dot(direction)
-                            asked = slope > 0.0 if outside == 1 else slope < 0.0
-                        if asked:
-                            bits = _solid_if(code, boxes, kinds, data, p, arg)
-                            if bits == 1 or bits == 2:
-                                best = t
-                                surface = arg
-                                side = 1 if bits == 2 else -1
+            for k in range(4):
+                t = found[k]
+                if low < t < best:
+                    p = origin + t * direction
+                    asked = True
+                    if (mode & INTO) != 0:
+                        # A surface knows which of its sides is solid wherever it bounds the part.
+                        slope = surface_normal(kinds[arg], data, arg, p).dot(direction)
+                        asked = slope > 0.0 if code[i, 2] == 1 else slope < 0.0
+                    if asked:
+                        found_side = _side_within(code, start, stop, kinds, data, p, arg)
+                        if found_side != 0:
+                            best = t
+                            surface = arg
+                            side = found_side
     return ti.Vector([best, ti.f64(surface), ti.f64(side)])
+
+
+@ti.func
+def nearest_hit(code: ti.template(), first: ti.template(), grid: ti.template(),
+                kinds: ti.template(), data: ti.template(),
+                origin, direction, reach, mode):  # fmt: skip
+    """Return (distance, surface or -1, side) of a ray's nearest hit.
+
+    The ray goes from cube to cube until a surface in one of them is hit. The mode says whether only
+    ways into the solid are looked at.
+    """
+    hit = ti.Vector([reach, -1.0, 0.0])
+    inverse = 1.0 / direction
+    span = _span(grid, origin, direction, inverse, reach)
+    t = span[0]
+    cube = _cube_of(grid, origin + t * direction)
+    # Along each axis: where the ray leaves its cube, how far it then is to the end of the next, how
+    # many are left, and how the number of the cube changes.
+    ahead = ti.Vector([FAR, FAR, FAR])
+    pitch = ti.Vector([0.0, 0.0, 0.0])
+    left = ti.Vector([0, 0, 0])
+    jump = ti.Vector([ti.i32(grid[2, 1]) * ti.i32(grid[2, 2]), ti.i32(grid[2, 2]), 1])
+    c = cube.dot(jump)
+    for k in ti.static(range(3)):
+        count = ti.i32(grid[2, k])
+        left[k] = cube[k]
+        if direction[k] > 0.0:
+            left[k] = count - 1 - cube[k]
+        else:
+            jump[k] = -jump[k]
+        if direction[k] != 0.0:
+            side = cube[k] + (1 if direction[k] > 0.0 else 0)
+            ahead[k] = (grid[0, k] + side * grid[1, k] - origin[k]) * inverse[k]
+            pitch[k] = grid[1, k] * ti.abs(inverse[k])
+    while t <= span[1] and hit[1] < 0.0 and ti.min(left[0], left[1], left[2]) >= 0:
+        beyond = ti.min(ahead[0], ahead[1], ahead[2])
+        start, stop = first[c], first[c + 1]
+        if start < stop:
+            low, high = ti.max(t - _SLACK, _NEAR), ti.min(beyond + _SLACK, reach)
+            hit = _nearest_within(
+                code, start, stop, kinds, data, origin, direction, low, high, mode
+            )
+        t = beyond
+        if ahead[0] == beyond:
+            ahead[0] += pitch[0]
+            c += jump[0]
+            left[0] -= 1
+        elif ahead[1] == beyond:
+            ahead[1] += pitch[1]
+            c += jump[1]
+            left[1] -= 1
+        else:
+            ahead[2] += pitch[2]
+            c += jump[2]
+            left[2] -= 1
+    return hit
 
 
 @ti.kernel
 def _cast_rays(
     # In:
     code_in: I32Rows,
-    boxes_in: F64Rows,
+    first_in: I32Array,
+    grid_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
-    faces_in: F64Rows,
     origins_in: F64Rows,
     directions_in: F64Rows,
     reach_in: F64Array,
@@ -254,7 +322,7 @@ def _cast_rays(
     """Follow every ray to its nearest hit."""
     for i in range(origins_in.shape[0]):
         hit = nearest_hit(
-            code_in, boxes_in, kinds_in, data_in, faces_in, vector(origins_in, i, 0),
+            code_in, first_in, grid_in, kinds_in, data_in, vector(origins_in, i, 0),
             vector(directions_in, i, 0), reach_in[i], mode,
         )  # fmt: skip
         distances_out[i] = hit[0]
@@ -266,7 +334,8 @@ def _cast_rays(
 def _classify_points(
     # In:
     code_in: I32Rows,
-    boxes_in: F64Rows,
+    first_in: I32Array,
+    grid_in: F64Rows,
     kinds_in: I32Array,
     data_in: F64Rows,
     points_in: F64Rows,
@@ -276,12 +345,5 @@ def _classify_points(
 ):
     """Ask for every point whether its surface decides that it is solid."""
     for i in range(points_in.shape[0]):
-        bits = _solid_if(
-            code_in, boxes_in, kinds_in, data_in, vector(points_in, i, 0), surface_in[i]
-        )
-        side = 0
-        if bits == 1:
-            side = -1
-        elif bits == 2:
-            side = 1
-        sides_out[i] = side
+        p = vector(points_in, i, 0)
+        sides_out[i] = side_at(code_in, first_in, grid_in, kinds_in, data_in, p, surface_in[i])

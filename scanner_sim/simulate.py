@@ -159,8 +159,7 @@ def scan_views(
     scanner = scanner or StripeScanner()
     report = progress or (lambda name, done: None)
     target = as_target(part)
-    far = far_enough(target, scanner.stand_off, StripeScanner().stand_off)
-    scanner = replace(scanner, stand_off=far)
+    scanner = far_enough(scanner, target)
     views = scanner.views or target.views or DEFAULT_VIEWS
     wanted = scanner.points or target.nominal_points
     free = scanner.stripe_pitch is None and scanner.point_pitch is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from scanner_sim.part import FlatPart, Part
 from scanner_sim.quadric import gradient
 from scanner_sim.raycast import cast
+from scanner_sim.scanner import StripeScanner
 from scanner_sim.truth import build_truth
 
 if TYPE_CHECKING:
@@ -123,8 +125,8 @@ class CsgTarget:
         self, positions: np.ndarray, normals: np.ndarray, directions: np.ndarray, reach: np.ndarray
     ) -> np.ndarray:
         """Return whether something stands in the way of points of the solid."""
-        lifted = positions + LIFT * normals
-        hits = cast(self.flat, lifted, directions, reach, any_hit=True, from_outside=True)
+        lifted = positions + self.lift * normals
+        hits = cast(self.flat, lifted, directions, reach, from_outside=True)
         hidden: np.ndarray = hits.surface >= 0
         return hidden
 
@@ -144,8 +146,9 @@ def as_target(part: Part | Target) -> Target:
     return CsgTarget(part) if isinstance(part, Part) else part
 
 
-def far_enough(target: Target, stand_off: float, default: float) -> float:
-    """Return the stand-off for a solid [mm]: what it asks for, if the scanner's is the default."""
-    if target.stand_off is None or not math.isclose(stand_off, default):
-        return stand_off
-    return max(target.stand_off, default)
+def far_enough(scanner: StripeScanner, target: Target) -> StripeScanner:
+    """Return the scanner as far away as a solid asks for, if its stand-off is the default."""
+    default = StripeScanner().stand_off
+    if target.stand_off is None or not math.isclose(scanner.stand_off, default):
+        return scanner
+    return replace(scanner, stand_off=max(target.stand_off, default))

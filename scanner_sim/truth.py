@@ -9,6 +9,7 @@ import numpy as np
 from octoseg_ti.types import NONE, EdgeClass, Truth
 from scanner_sim.edges import trace_edges
 from scanner_sim.faces import goes_on
+from scanner_sim.links import components, in_doubt, link_mesh
 from scanner_sim.nearest import nearest_edge
 
 if TYPE_CHECKING:
@@ -93,14 +94,11 @@ def find_patches(
         Patch of every point, 0..K-1, shape (N,), i32; -1 = none.
     """
     faces = _Faces(part, position, surface, edge_distance, goes_on)
-    pairs = _mesh_pairs(stripe, column)
-    pairs = pairs[surface[pairs[:, 0]] == surface[pairs[:, 1]]]
-    pairs = pairs[(faces.length(pairs) <= reach)]
-    pairs = pairs[faces.connect(pairs)]
-    piece = _components(pairs, len(position))
+    piece, doubtful = link_mesh(position, surface, stripe, column, edge_distance, reach)
+    piece = components(piece[doubtful[faces.connect(doubtful)]], piece.max() + 1)[piece]
     # Most pieces overlap far from any edge; what is left to bridge are few points near edges.
-    piece = _components(_overlaps(faces, piece, reach), piece.max() + 1)[piece]
-    piece = _components(_bridges(faces, piece, reach), piece.max() + 1)[piece]
+    piece = components(_overlaps(faces, piece, reach), piece.max() + 1)[piece]
+    piece = components(_bridges(faces, piece, reach), piece.max() + 1)[piece]
     size = np.bincount(piece)
     size[piece[part.surfaces.fillet[surface]]] = 0
     rank = np.full(len(size), NONE, np.int32)
@@ -108,28 +106,6 @@ def find_patches(
     large = order[size[order] >= _SLIVER]
     rank[large] = np.arange(len(large))
     return rank[piece]
-
-
-def _mesh_pairs(stripe: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """Return pairs of close points, along the stripes and across them, shape (P, 2)."""
-    width = int(column.max()) + 3
-    key = stripe.astype(np.int64) * width + column
-    pairs = []
-    for step in (1, 2, width - 1, width, width + 1, 2 * width):
-        place = np.minimum(np.searchsorted(key, key + step), len(key) - 1)
-        near = np.flatnonzero(key[place] == key + step)
-        pairs.append(np.column_stack([near, place[near]]))
-    return np.concatenate(pairs)
-
-
-def _components(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Return the connected component of every node, shape (count,)."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), (count, count))
-    labels: np.ndarray = connected_components(graph, directed=False)[1]
-    return labels
 
 
 class _Faces(NamedTuple):
@@ -149,9 +125,9 @@ class _Faces(NamedTuple):
     def connect(self, pairs: np.ndarray) -> np.ndarray:
         """Return whether the face goes on between two of its points, shape (P,), bool."""
         whole = np.ones(len(pairs), bool)
-        room = self.edge_distance[pairs].sum(axis=1)
+        clear = self.edge_distance[pairs[:, 0]] + self.edge_distance[pairs[:, 1]]
         # Where the edges are too far to come between the points, there is nothing to test.
-        doubtful = np.flatnonzero(room <= 1.1 * self.length(pairs) + 0.02)
+        doubtful = np.flatnonzero(in_doubt(clear, self.length(pairs)))
         if self.goes_on is not None:
             whole[doubtful] = self.goes_on(pairs[doubtful])
             return whole

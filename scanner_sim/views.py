@@ -148,8 +148,7 @@ def plan_views(
         raise DataError(f"at least one view is needed, not {count}")
     target = as_target(part)
     limits = target.box
-    far = far_enough(target, scanner.stand_off, StripeScanner().stand_off)
-    scanner = replace(scanner, stand_off=far)
+    scanner = far_enough(scanner, target)
     samples = _spread_samples(target)
     candidates = head.orientations(_COARSE)
     passes = [_side_by_side(view, limits, scanner, overlap) for view in candidates]
@@ -189,8 +188,7 @@ def covered_share(part: Part | Target, scanner: StripeScanner, views: tuple[View
     """
     target = as_target(part)
     limits = target.box
-    far = far_enough(target, scanner.stand_off, StripeScanner().stand_off)
-    scanner = replace(scanner, stand_off=far)
+    scanner = far_enough(scanner, target)
     samples = _spread_samples(target)
     some = np.zeros(len(samples.position), bool)
     for view in ProbeHead().orientations(_COARSE):

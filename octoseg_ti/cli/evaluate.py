@@ -86,17 +86,22 @@ def _score(path: Path, options: EvaluateOptions) -> tuple[Scores, str]:
     from octoseg_ti.evaluation import evaluate
 
     where = options.truth or path
-    truth = files.read_truth(where)
+    result, source = result_in(path), "recorded result"
+    scans = None
+    if result is None and options.truth is None:
+        scans, truth = files.read_with_truth(path)
+    else:
+        truth = files.read_truth(where)
     if truth is None:
         raise DataError("holds no truth to score against", path=where, hint="name one by --truth")
-    result, source = result_in(path), "recorded result"
     if result is None:
         from octoseg_ti.pipeline import segment
 
         source = "segmented now, default parameters"
         if not options.quiet:
             note(f"{path}: holds no result; segmenting it now")
-        scans = files.read(path)
+        if scans is None:
+            scans = files.read(path)
         with progress("segment", quiet=options.quiet) as report:
             result = segment(scans, progress=report)
     if len(result) != len(truth):

@@ -101,6 +101,7 @@ def _plan(ti: Any, kernel: Any, program: Any) -> _Plan | None:
         or len(setters) > _MOST
         or kernel.return_type is not None
         or kernel.has_print
+        or program.config().arch != ti.cpu  # a device's arrays are no NumPy arrays: none would fit
         or len(kernel.compiled_kernels) != 1
         or program.config().debug
     ):

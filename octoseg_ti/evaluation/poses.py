@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from octoseg_ti.errors import DataError
+from octoseg_ti.types import rotation_angle
 
 
 def pose_errors(T_world_view: np.ndarray, true: np.ndarray) -> tuple[float, float]:
@@ -32,8 +33,5 @@ def pose_errors(T_world_view: np.ndarray, true: np.ndarray) -> tuple[float, floa
                 continue
             error = np.linalg.inv(true_back[i] @ true[j]) @ (back[i] @ T_world_view[j])
             shift = max(shift, float(np.linalg.norm(error[:3, 3])))
-            # Half the skew part has the length of the sine: exact for small angles.
-            sine = float(np.linalg.norm(error[:3, :3] - error[:3, :3].T)) / np.sqrt(8.0)
-            cosine = (float(np.trace(error[:3, :3])) - 1.0) / 2.0
-            angle = max(angle, float(np.arctan2(sine, cosine)))
+            angle = max(angle, float(rotation_angle(error)))
     return shift, angle

@@ -5,24 +5,17 @@ neighbourhoods of many samples are candidates; the one that explains most of wha
 long as fitting it anew lets it explain more (Besl and Jain 1988), and takes what it explains.
 """
 
-from dataclasses import dataclass
 from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
 
-from octoseg_ti.device import runtime
-from octoseg_ti.device.linalg import row, vec3
-from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
-from octoseg_ti.device.surfaces import KINDS, evaluate_surfaces, surface_at
+from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.stages.leaves import Leaves, Samples
-from octoseg_ti.stages.primitives import Fits, fit_all
-from octoseg_ti.stages.selection import choose
+from octoseg_ti.stages.sets import Surfaces, fit_sets, joined, lie_on, no_surfaces, spread
 from octoseg_ti.types import NONE
 
-# A surface fits when its residual is below this many noises.
-_FIT = 1.5
 # A sample lies on a surface within this many noises.
 _ON = 3.0
 # A surface explains a set when this share of it lies on it.
@@ -35,14 +28,18 @@ _MANY, _SOME = 200, 150
 _NEAR = (20, 60, 150)
 # Samples of a set that tell how much a candidate explains.
 _SCORED = 3000
-_SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS = 40, 8, 200
+# Seeds of a set, and into how many looks they are divided: each looks at what is left.
+_SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS, _LOOKS = 40, 8, 200, 2
 # A surface grows until it gains less than this, at most so often.
 _GAIN, _GROWTHS = 1.02, 4
 _LEFT = 0.005
+# Candidates that explain this share of what the best one does grow together with it, and are
+# taken together when so much of them is left by the larger ones.
+_TOGETHER, _KEPT = 0.25, 0.8
 # Surfaces that a set was taken apart into are real when they explain so much of it, and leave no
-# more than this many noises, fewer the less they explain: pieces of a free form are cut out as far
-# as they just fit, and leave gaps.
-_COVERED, _REAL = 0.6, 1.15
+# more than so many noises, fewer the less they explain and the more of it neighbours share: pieces
+# of a free form are cut out as far as they just fit, and leave gaps and waves.
+_COVERED, _REAL = 0.6, 1.75
 # ... and at any rate when they leave no more than this many: what is cut out as far as it just fits
 # leaves half of its reach.
 _EXACT = 0.5
@@ -57,147 +54,6 @@ class Tolerance(NamedTuple):
     """Largest angle between the normals of a sample and of its surface [rad]."""
     points: float
     """Fewest points of a surface."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Surfaces:
-    """Analytic surfaces, ``M`` of them."""
-
-    kind: np.ndarray
-    """`SurfaceKind`, shape (M,), i32."""
-    parameters: np.ndarray
-    """As in `Segmentation.parameters`, but relative to the corner of the grid, shape (M, 8)."""
-
-    def __len__(self) -> int:
-        """Return the number of surfaces."""
-        return len(self.kind)
-
-    def joined(self, other: "Surfaces") -> "Surfaces":
-        """Return these and other surfaces."""
-        return Surfaces(
-            kind=np.concatenate([self.kind, other.kind]),
-            parameters=np.concatenate([self.parameters, other.parameters]),
-        )
-
-    def at(self, which: np.ndarray) -> "Surfaces":
-        """Return some of the surfaces."""
-        return Surfaces(kind=self.kind[which], parameters=self.parameters[which])
-
-
-def no_surfaces() -> Surfaces:
-    """Return no surface."""
-    return Surfaces(kind=np.zeros(0, np.int32), parameters=np.zeros((0, 8)))
-
-
-@ti.kernel
-def _lie_on(
-    limit: ti.f64,
-    cosine: ti.f64,
-    # In:
-    point_in: F64Rows,
-    normal_in: F64Rows,
-    sample_in: I32Array,
-    surface_in: F64Rows,
-    range_in: I32Rows,
-    # Out:
-    on_out: I32Array,
-):
-    """Say for every surface which samples of its range lie on it."""
-    for s in range(range_in.shape[0]):
-        kind = ti.cast(surface_in[s, 8], ti.i32)
-        origin = row(surface_in, s)
-        axis = vec3(surface_in[s, 3], surface_in[s, 4], surface_in[s, 5])
-        for j in range(range_in[s, 0], range_in[s, 1]):
-            i = sample_in[j]
-            d, n = surface_at(
-                kind, row(point_in, i), origin, axis, surface_in[s, 6], surface_in[s, 7]
-            )
-            m = row(normal_in, i)
-            on = ti.cast(ti.abs(d) <= limit, ti.i32)
-            if ti.abs(n.dot(m)) < cosine and m.norm_sqr() > 0.0:
-                on = 0
-            on_out[range_in[s, 2] + j - range_in[s, 0]] = on
-
-
-def lie_on(
-    samples: Samples,
-    sets: list[np.ndarray],
-    which: np.ndarray,
-    surfaces: Surfaces,
-    limit: float,
-    turn: float,
-) -> list[np.ndarray]:
-    """Return for every surface which samples of a set lie on it.
-
-    Args:
-        samples: The samples.
-        sets: Sets of samples.
-        which: The set that every surface is compared with, shape (M,).
-        surfaces: The surfaces.
-        limit: Largest distance [mm].
-        turn: Largest angle between the normals [rad].
-
-    Returns:
-        Whether each sample of the set lies on the surface, an array of bool for every surface.
-    """
-    runtime.ensure_started()
-    if len(surfaces) == 0:
-        return []
-    length = np.array([len(s) for s in sets], np.int64)
-    begin = np.cumsum(length) - length
-    out = np.cumsum(length[which]) - length[which]
-    ranges = np.stack([begin[which], begin[which] + length[which], out], axis=1).astype(np.int32)
-    on = runtime.empty(int(length[which].sum()), np.int32)
-    _lie_on(
-        limit,
-        float(np.cos(min(turn, np.pi / 2))),
-        runtime.upload(samples.point),
-        runtime.upload(samples.normal),
-        runtime.upload(np.concatenate(sets).astype(np.int32)),
-        runtime.upload(np.column_stack([surfaces.parameters, surfaces.kind])),
-        runtime.upload(ranges),
-        on,
-    )
-    found = runtime.download(on).astype(bool)
-    return [found[o : o + n] for o, n in zip(out, length[which], strict=True)]
-
-
-def spread(members: np.ndarray, most: int) -> np.ndarray:
-    """Return at most so many members, evenly spaced."""
-    if len(members) <= most:
-        return members
-    return members[(2 * np.arange(most) + 1) * len(members) // (2 * most)]
-
-
-def fit_sets(
-    samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool = False
-) -> tuple[np.ndarray, Surfaces]:
-    """Fit the simplest surface to every set of samples.
-
-    Returns:
-        Which sets have one, indices, shape (M,), and these surfaces.
-    """
-    if not sets:
-        return np.zeros(0, np.int64), no_surfaces()
-    return _simplest_of(_fit(samples, sets, noise, robust=robust), noise, samples.signed)
-
-
-def _fit(samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool = False) -> Fits:
-    """Fit all kinds of surfaces to every set of samples."""
-    start = np.cumsum([0] + [len(s) for s in sets])
-    index = np.concatenate(sets)
-    return fit_all(
-        samples.point[index], samples.normal[index], None, start, noise=noise, robust=robust
-    )
-
-
-def _simplest_of(fits: Fits, noise: float, signed: bool) -> tuple[np.ndarray, Surfaces]:
-    """Return which fits give a surface, and the simplest of each."""
-    chosen = choose(fits, noise=noise, room=_FIT, signed=signed)
-    fitted = np.flatnonzero((chosen.kind >= 0) & (chosen.kind < KINDS))
-    return fitted, Surfaces(
-        kind=chosen.kind[fitted].astype(np.int32), parameters=chosen.parameters[fitted]
-    )
 
 
 def explain(
@@ -224,8 +80,7 @@ def explain(
     noise = tolerance.noise
     if not sets:
         return no_surfaces(), label
-    fits = _fit(samples, [spread(s, _MANY) for s in sets], noise, robust=True)
-    fitted, whole = _simplest_of(fits, noise, samples.signed)
+    fitted, whole = fit_sets(samples, [spread(s, _MANY) for s in sets], noise, robust=True)
     turn = max(tolerance.turn, 0.5)
     on = lie_on(samples, sets, fitted, whole, (_ON + 0.5) * noise, turn)
     likely, sure = np.zeros(len(sets), bool), np.zeros(len(sets), bool)
@@ -275,25 +130,6 @@ def _neighborhoods(point: np.ndarray, seeds: np.ndarray, count: int) -> np.ndarr
     return np.sort(near, axis=1)
 
 
-def _candidates(
-    samples: Samples, sets: list[np.ndarray], noise: float
-) -> tuple[Surfaces, np.ndarray]:
-    """Return surfaces through neighbourhoods of seeds, and the set of each."""
-    groups, owner = [], []
-    for s, members in enumerate(sets):
-        most = int(np.clip(len(members) // _SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS))
-        seeds = spread(np.arange(len(members)), most)
-        place = samples.point[members]
-        for count in _NEAR:
-            near = _neighborhoods(place, seeds, min(count, len(members)))
-            groups += list(members[near])
-            owner += [s] * len(near)
-            if count >= len(members):
-                break
-    fitted, surfaces = fit_sets(samples, groups, noise)
-    return surfaces, np.array(owner, np.int64)[fitted]
-
-
 class _Set:
     """A set that is taken apart: what is left of it, and its candidates."""
 
@@ -308,9 +144,23 @@ class _Set:
         both = (a >= 0) & (b >= 0)
         self.a, self.b = a[both], b[both]
         self.total = np.bincount(self.place, weights=self.weight, minlength=len(self.leaf))
-        self.scored = spread(np.arange(len(members)), _SCORED)
-        self.on = np.zeros((0, len(self.scored)), np.float32)
+        self.seeds = int(np.clip(len(members) // _SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS))
+        self.each = max(self.seeds // _LOOKS, _LEAST_SEEDS)
+        self.scored = np.zeros(0, np.int64)
+        self.on = np.zeros((0, 0), np.float32)
         self.surfaces = no_surfaces()
+
+    def neighborhoods(self, point: np.ndarray) -> list[np.ndarray]:
+        """Return samples around some that are left, in several sizes."""
+        left = self.members[self.free]
+        seeds = spread(np.arange(len(left)), min(self.each, self.seeds))
+        self.seeds -= self.each
+        near: list[np.ndarray] = []
+        for count in _NEAR:
+            near += list(left[_neighborhoods(point[left], seeds, min(count, len(left)))])
+            if count >= len(left):
+                break
+        return near
 
     def connected(self, on: np.ndarray) -> np.ndarray:
         """Return the largest connected part of some members, bool."""
@@ -325,17 +175,49 @@ class _Set:
         size = np.bincount(part[part >= 0], weights=self.weight[part >= 0])
         return part == int(np.argmax(size))
 
-    def best(self, least: float) -> tuple[int, np.ndarray] | None:
-        """Return the candidate that explains most of what is left, and what it explains."""
-        weight = (self.weight * self.free)[self.scored].astype(np.float32)
-        weight *= np.float32(self.weight.sum() / max(self.weight[self.scored].sum(), 1e-300))
-        support = np.einsum("cs,s->c", self.on, weight)  # no BLAS: its sums depend on threads
-        if len(support) == 0:
-            return None
-        c = int(np.argmax(support))
-        if support[c] < least:
-            return None
-        return c, self.on[c] > 0
+    def best(self, least: float) -> list[int]:
+        """Return the candidates that explain most of what is left, each without the others."""
+        weight = (self.weight * self.free)[self.scored]
+        share = self.weight[self.free].sum() / max(weight.sum(), 1e-300)
+        weight = (share * weight).astype(np.float32)
+        chosen: list[int] = []
+        while len(self.on):
+            support = np.einsum("cs,s->c", self.on, weight)  # no BLAS: its sums depend on threads
+            c = int(np.argmax(support))
+            if support[c] < least:
+                break
+            if not chosen:
+                least = max(least, _TOGETHER * float(support[c]))
+            chosen.append(c)
+            weight *= 1.0 - self.on[c]
+        return chosen
+
+    def take(self, part: np.ndarray) -> None:
+        """Take away what a surface explains."""
+        self.free &= ~part
+        self.on[:, ~self.free[self.scored]] = 0.0
+
+    def ended(self, least: float) -> bool:
+        """Return whether too little is left for another surface."""
+        left = self.weight[self.free].sum()
+        return bool(left < max(_LEFT * self.weight.sum(), least))
+
+
+def _find_candidates(samples: Samples, work: list[_Set], tolerance: Tolerance) -> None:
+    """Give sets the surfaces through neighbourhoods of what is left of them for candidates."""
+    groups = [w.neighborhoods(samples.point) for w in work]
+    owner = np.repeat(np.arange(len(work)), [len(g) for g in groups])
+    fitted, surfaces = fit_sets(samples, [near for g in groups for near in g], tolerance.noise)
+    owner = owner[fitted]
+    for w in work:
+        w.scored = spread(np.flatnonzero(w.free), _SCORED)
+    scored = [w.members[w.scored] for w in work]
+    limit = _ON * tolerance.noise
+    on = lie_on(samples, scored, owner, surfaces, limit, tolerance.turn)
+    for s, w in enumerate(work):
+        mine = np.flatnonzero(owner == s)
+        w.surfaces = surfaces.at(mine)
+        w.on = np.array([on[c] for c in mine], np.float32).reshape(len(mine), len(w.scored))
 
 
 def _take_apart(
@@ -344,37 +226,27 @@ def _take_apart(
     """Find the surfaces of sets that no single one explains."""
     label = np.full(len(samples), NONE, np.int32)
     found = no_surfaces()
-    if not sets:
-        return found, label
-    noise, limit = tolerance.noise, _ON * tolerance.noise
-    surfaces, owner = _candidates(samples, sets, noise)
-    work = [_Set(samples, leaves, members) for members in sets]
-    scored = [w.members[w.scored] for w in work]
-    on = lie_on(samples, scored, owner, surfaces, limit, tolerance.turn)
-    for s, w in enumerate(work):
-        mine = np.flatnonzero(owner == s)
-        w.surfaces = surfaces.at(mine)
-        w.on = np.array([on[c] for c in mine], np.float32).reshape(len(mine), len(w.scored))
-    active = list(range(len(sets)))
+    active = [_Set(samples, leaves, members) for members in sets]
     while active:
-        chosen = {s: work[s].best(tolerance.points) for s in active}
-        active = [s for s in active if chosen[s] is not None]
-        if not active:
-            break
-        start = [work[s].surfaces.at(np.array([chosen[s][0]])) for s in active]  # type: ignore[index]
-        grown = _grow(samples, [work[s] for s in active], start, tolerance)
-        for s, (surface, part) in zip(list(active), grown, strict=True):
-            w = work[s]
-            if w.weight[part].sum() < tolerance.points:
-                w.on[chosen[s][0]] = 0.0  # type: ignore[index]
-                continue
-            label[w.members[part]] = len(found)
-            found = found.joined(surface)
-            w.free &= ~part
-            w.on[:, ~w.free[w.scored]] = 0.0
-            if w.weight[w.free].sum() < max(_LEFT * w.weight.sum(), tolerance.points):
-                active.remove(s)
-    return _real_ones(samples, sets, found, label, noise)
+        _find_candidates(samples, active, tolerance)
+        gained: dict[_Set, None] = {}
+        going = active
+        while going:
+            wave = [(w, c) for w in going for c in w.best(tolerance.points)]
+            start = [w.surfaces.at(np.array([c])) for w, c in wave]
+            taken: dict[_Set, None] = {}
+            for k, surface, part in _grow(samples, [w for w, _ in wave], start, tolerance):
+                w, size = wave[k][0], wave[k][0].weight[part].sum()
+                left = part & w.free
+                if w.weight[left].sum() >= max(_KEPT * size, tolerance.points):
+                    label[w.members[left]] = len(found)
+                    found = found.joined(surface)
+                    w.take(left)
+                    taken[w] = None
+            going = [w for w in taken if not w.ended(tolerance.points)]
+            gained |= taken
+        active = [w for w in gained if w.seeds > 0 and not w.ended(tolerance.points)]
+    return _real_ones(samples, sets, found, label, tolerance.noise)
 
 
 def _real_ones(
@@ -391,7 +263,10 @@ def _real_ones(
         far, _ = evaluate_surfaces(samples.point[members[on]], name, found.kind, found.parameters)
         covered = weight.sum() / total
         rms = np.sqrt(np.average(far**2, weights=weight))
-        real[name] = covered >= _COVERED and rms <= covered * _REAL * noise
+        pair = name[1:] == name[:-1]
+        product, square = far[1:][pair] * far[:-1][pair], far[1:][pair] ** 2
+        shared = max(0.0, float(product.sum()) / max(float(square.sum()), 1e-300))
+        real[name] = covered >= _COVERED and (1.0 + shared) * rms <= covered * _REAL * noise
         ids, rank = np.unique(name, return_inverse=True)
         each = np.sqrt(np.bincount(rank, weight * far**2) / np.bincount(rank, weight))
         real[ids[each <= _EXACT * noise]] = True
@@ -403,36 +278,37 @@ def _real_ones(
 
 def _grow(
     samples: Samples, work: list[_Set], start: list[Surfaces], tolerance: Tolerance
-) -> list[tuple[Surfaces, np.ndarray]]:
-    """Grow a surface in every set while fitting it anew lets it explain more."""
+) -> list[tuple[int, Surfaces, np.ndarray]]:
+    """Grow surfaces in their sets while fitting them anew lets them explain more.
 
-    def explained(which: list[int], surfaces: list[Surfaces]) -> list[np.ndarray]:
-        members = [work[i].members for i in which]
-        all_surfaces = no_surfaces()
-        for one in surfaces:
-            all_surfaces = all_surfaces.joined(one)
+    Returns:
+        Number, surface and what it explains, of those that explain enough; the largest first.
+    """
+
+    def explained(which: list[int], surfaces: Surfaces) -> list[np.ndarray]:
+        sets = list(dict.fromkeys(work[i] for i in which))
+        place = {w: s for s, w in enumerate(sets)}
         on = lie_on(
-            samples, members, np.arange(len(which)), all_surfaces, _ON * tolerance.noise,
-            tolerance.turn,
+            samples, [w.members for w in sets], np.array([place[work[i]] for i in which], np.int64),
+            surfaces, _ON * tolerance.noise, tolerance.turn,
         )  # fmt: skip
         return [work[i].connected(o & work[i].free) for i, o in zip(which, on, strict=True)]
 
-    surface = list(start)
-    part = explained(list(range(len(work))), surface)
-    growing = [i for i, p in enumerate(part) if p.any()]
+    surface, part = list(start), explained(list(range(len(work))), joined(start))
+    size = [w.weight[p].sum() for w, p in zip(work, part, strict=True)]
+    growing = [i for i in range(len(work)) if size[i] >= tolerance.points]
     for _ in range(_GROWTHS):
         if not growing:
             break
         groups = [spread(work[i].members[part[i]], _SOME) for i in growing]
         fitted, fits = fit_sets(samples, groups, tolerance.noise, robust=True)
         which = [growing[f] for f in fitted]
-        wider = explained(which, [fits.at(np.array([k])) for k in range(len(fitted))])
         growing = []
-        for k, i in enumerate(which):
-            before = work[i].weight[part[i]].sum()
-            after = work[i].weight[wider[k]].sum()
+        for k, (i, wider) in enumerate(zip(which, explained(which, fits), strict=True)):
+            before, after = size[i], work[i].weight[wider].sum()
             if after >= 0.9 * before:
-                surface[i], part[i] = fits.at(np.array([k])), wider[k]
+                surface[i], part[i], size[i] = fits.at(np.array([k])), wider, after
                 if after > _GAIN * before:
                     growing.append(i)
-    return list(zip(surface, part, strict=True))
+    order = np.argsort([-s for s in size], kind="stable")
+    return [(int(i), surface[i], part[i]) for i in order if size[i] >= tolerance.points]

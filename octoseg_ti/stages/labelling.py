@@ -28,9 +28,9 @@ class Rule(NamedTuple):
     """Deviation of a point from its surface [mm]."""
     tilt: float
     """Deviation of its normal [rad]."""
-    reach: float = 4.0
+    reach: float = 2.5
     """Farthest point of a surface, in noises."""
-    turn: float = 1.0
+    turn: float = 0.4
     """Largest angle between the normals of a point and of its surface [rad]."""
 
 
@@ -123,17 +123,14 @@ def _choose(
                 origin = row(surface_in, s)
                 axis = vec3(surface_in[s, 3], surface_in[s, 4], surface_in[s, 5])
                 d, n = surface_at(kind, p, origin, axis, surface_in[s, 6], surface_in[s, 7])
-                cosine = ti.abs(n.dot(m))
-                if surface_in[s, 9] != 0.0:  # the side is known: the back of a wall is another
-                    cosine = surface_in[s, 9] * n.dot(m)
-                angle = ti.acos(ti.max(-1.0, ti.min(1.0, cosine)))
+                angle = ti.acos(ti.min(1.0, ti.abs(n.dot(m))))
                 if m.norm_sqr() == 0.0:
                     angle = 0.0
                 off = ti.abs(d) / rule[0]
                 if angle <= rule[3]:
                     tilt = angle / rule[1]
                     tilt = ti.min(tilt, 6.0 + 0.1 * ti.max(tilt - 6.0, 0.0))
-                    cost = off * off + tilt * tilt
+                    cost = off * off + tilt * tilt + surface_in[s, 9]
                     if off <= rule[2] and cost < best:
                         next_best = best
                         second_out[i] = label_out[i]
@@ -207,15 +204,19 @@ def label_lists(leaves: Leaves, label: np.ndarray) -> np.ndarray:
     )
 
 
-def surface_table(kind: np.ndarray, parameters: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """Return surfaces as rows for kernels: parameters (8), kind, and side, shape (M, 10).
+def surface_table(
+    kind: np.ndarray, parameters: np.ndarray, handicap: np.ndarray | None = None
+) -> np.ndarray:
+    """Return surfaces as rows for kernels: parameters (8), kind, and handicap, shape (M, 10).
 
     Args:
         kind: `SurfaceKind` of every surface, analytic, shape (M,).
         parameters: As in `Segmentation.parameters`, shape (M, 8).
-        side: 1 where measured normals point outward, -1 inward, 0 = either, shape (M,).
+        handicap: What is added to the cost of every surface, shape (M,); None = nothing.
     """
-    return np.column_stack([parameters, kind, side])
+    return np.column_stack(
+        [parameters, kind, np.zeros(len(kind)) if handicap is None else handicap]
+    )
 
 
 def label_points(

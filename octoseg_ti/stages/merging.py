@@ -6,14 +6,16 @@ import numpy as np
 
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
-from octoseg_ti.stages.extraction import Surfaces, fit_sets, spread
 from octoseg_ti.stages.leaves import Leaves, Samples
+from octoseg_ti.stages.sets import Surfaces, fit_sets, spread
 from octoseg_ti.types import NONE
 
 # Samples of each surface in a common fit.
 _SAMPLES = 150
 # Two surfaces are one when the residual of neither grows by more than this.
 _WORSE = 1.15
+# ... or within so many noises all the same.
+_ALIKE = 1.1
 # ... and stays within this many noises.
 _FIT = 1.2
 # Distances beyond this many noises count as this many.
@@ -23,7 +25,7 @@ _FEW = 10
 _UNIT = 1024.0
 # What deviates by no more than this many noises and tilts, and is no larger than this share of the
 # surface beside it, is an error of its form.
-_FORM, _SMOOTH, _SMALL = 4.0, 3.0, 0.15
+_FORM, _SMOOTH, _SMALL = 4.0, 3.0, 0.25
 
 
 def contacts(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -90,7 +92,7 @@ def merge_surfaces(
         return name, surfaces
     pairs = pairs[fitted]
     mixed, own = _residuals(samples, parts, pairs, common, surfaces, noise)
-    fine = (mixed <= np.maximum(_WORSE * own, noise)) & (mixed <= _FIT * noise)
+    fine = (mixed <= np.maximum(_WORSE * own, _ALIKE * noise)) & (mixed <= _FIT * noise)
     order = np.argsort(mixed.max(axis=1, initial=0.0), kind="stable")
     parameters, kind = surfaces.parameters.copy(), surfaces.kind.copy()
     used = np.zeros(len(surfaces), bool)

@@ -3,9 +3,10 @@
 Second differences along a stripe see what two neighbours do not share. What decides whether a point
 lies on a surface is more than that: steps of the range, speckle over several points, views that do
 not quite meet. It is measured where it matters, as the residual of the best analytic surface
-through neighbourhoods of about a hundred points of one region, taken at the calmest third of
-them. Where faces are a few neighbourhoods large, nearly all would reach over an edge if regions did
-not keep them apart.
+through neighbourhoods of about a hundred points of one region: of half of them, for edges run
+through some of the others. (Where faces are a few neighbourhoods large, edges would run through
+nearly all if regions did not keep them apart.) A quadric does for most of them; where it bends too
+much, surfaces are fitted.
 """
 
 import numpy as np
@@ -13,13 +14,19 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.primitives import FREEDOM, fit_all
+from octoseg_ti.stages.quadrics import QUADRIC_FREEDOM, fit_quadrics
 
 # Neighbourhoods, and the points of each.
 _COUNT, _POINTS = 256, 128
 _FEWEST = 24
 # The points of a neighbourhood are among so many times as many in Morton order.
 _WINDOW = 4
-_CALM = 1.0 / 3.0
+# The median counts, up to so many times the lower quartile: edges may run through most.
+_CALM, _MIDDLE, _EDGES = 0.25, 0.5, 1.5
+# A quadric is no surface any more where it turns by so much from the middle to the rim [rad].
+_BEND = 0.35
+# Where it leaves so many times what it leaves of the calm ones, there is an edge.
+_EDGE = 8.0
 
 
 def surface_noise(grid: Grid, leaves: np.ndarray, group: np.ndarray) -> float | None:
@@ -59,7 +66,28 @@ def surface_noise(grid: Grid, leaves: np.ndarray, group: np.ndarray) -> float | 
     # In an order that has nothing to do with that of the input.
     order = np.lexsort((*point.T, np.repeat(np.arange(len(count)), count)))
     point, normal = point[order], runtime.download(grid.normal)[index[order]]
-    fit = fit_all(point, normal, None, np.append(begin, len(index)).astype(np.int32))
-    spare = count[:, None] / (count[:, None] - FREEDOM[None, :])
-    rms = np.where(np.isfinite(fit.rms), fit.rms * np.sqrt(spare), np.inf).min(axis=1)
-    return float(np.quantile(rms, _CALM))
+    rms = _residuals(point, normal, np.append(begin, len(index)))
+    calm, middle = np.quantile(rms, [_CALM, _MIDDLE])
+    return float(min(middle, _EDGES * calm))
+
+
+def _residuals(point: np.ndarray, normal: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return what the surface through every group leaves [mm], shape (G,).
+
+    Args:
+        point: Points of the groups, one group after the other [mm], shape (S, 3).
+        normal: Their normals, shape (S, 3).
+        start: First point of every group, and S at the end, shape (G + 1,).
+    """
+    count = np.diff(start)
+    found = fit_quadrics(point, normal, start)
+    rms = found.rms[:, 1] * np.sqrt(count / np.maximum(count - QUADRIC_FREEDOM, 1))
+    bent = (found.bend > _BEND) & (rms <= _EDGE * np.quantile(rms, _CALM))
+    if bent.any():
+        mine = np.repeat(bent, count)
+        ends = np.concatenate([[0], np.cumsum(count[bent])]).astype(np.int32)
+        fit = fit_all(point[mine], normal[mine], None, ends)
+        spare = count[bent, None] / (count[bent, None] - FREEDOM[None, :])
+        best = np.where(np.isfinite(fit.rms), fit.rms * np.sqrt(spare), np.inf).min(axis=1)
+        rms[bent] = np.minimum(rms[bent], best)
+    return rms

@@ -6,12 +6,13 @@ import numpy as np
 
 from octoseg_ti.device.surfaces import KINDS
 from octoseg_ti.stages.primitives import FREEDOM, Fits, covariance
+from octoseg_ti.stages.quadrics import Quadrics
 from octoseg_ti.types import SurfaceKind
 
 # A parameter more has to gain this many times log(n) in log-likelihood (times 2). BIC asks for 1
 # and takes the noise of points for independent; three times that holds where stripes or views share
 # some of it, and is four standard deviations for a hundred points.
-_PENALTY = 3.0
+_PENALTY = 8.0
 _COUNTED = 500  # points beyond these prove nothing more: then it is form, no noise, that is seen
 _FORM = 0.1  # deviations of form, in noise, that no kind has to explain
 _ROUNDING = 1e-5  # ... and in extents, for data without noise
@@ -98,6 +99,29 @@ def choose(
         side=np.where(found, np.sign(np.nan_to_num(fits.side[rows, best])), 0.0),
         evidence=evidence,
     )
+
+
+def plane_does(
+    flat: Quadrics, count: np.ndarray, *, noise: float, room: float = _ROOM
+) -> np.ndarray:
+    """Say which groups `choose` would take for planes, whatever else were fitted to them.
+
+    Args:
+        flat: Planes and quadrics through the groups; the quadrics stand for all curved surfaces.
+        count: Points of the groups, shape (G,).
+        noise: As of `choose`.
+        room: As of `choose`.
+
+    Returns:
+        Shape (G,), bool.
+    """
+    counted = np.clip(count, 2, _COUNTED)
+    square = flat.rms**2 + (_FORM * noise) ** 2 + 1e-300
+    turn = flat.tilt**2 + _SMOOTH**2
+    gain = np.log(square[:, 0] / square[:, 1]) + _NORMALS * np.log(turn[:, 0] / turn[:, 1])
+    sided = np.abs(flat.side) >= _ONE_SIDED * np.sqrt(np.maximum(1.0 - flat.tilt[:, 0] ** 2, 0.0))
+    fitting = (flat.rms[:, 0] <= room * noise) & (flat.tilt[:, 0] <= _TILT_ALWAYS) & sided
+    return fitting & (count > FREEDOM[0]) & (counted * gain <= _PENALTY * np.log(counted))
 
 
 def _agrees(fits: Fits, loss: np.ndarray, signed: bool) -> np.ndarray:

@@ -25,22 +25,24 @@ def _ramp() -> Part:
     return union(box((-20, -5, -2), (4, 5, 0)), intersection(face, box((-1, -5, -2), (4, 5, 8))))
 
 
-def _measure(height: float, **values: float) -> tuple[StripeScanner, Fan, Peaks, Peaks, np.ndarray]:
+def _measure(
+    height: float, offset: float = 0.0, **values: float
+) -> tuple[StripeScanner, Fan, Peaks, Peaks, np.ndarray]:
     """Aim at the face at a height above the floor."""
     values = {"specular": 0.3, "lobe": math.radians(2.0), **values}
     scanner = StripeScanner(**values)  # type: ignore[arg-type]
     rotation = View().rotation()
     x, y = height / math.tan(TILT), np.linspace(-3.0, 3.0, 7)
-    source = np.array([[x, 0.0, scanner.stand_off]])
+    source = np.array([[x, offset, scanner.stand_off]])
     ray = np.column_stack([0 * y, y, np.full(7, -scanner.stand_off)])
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     fan = Fan(source, ray @ rotation.T, rotation)
-    direct = peaks_of_solid(CsgTarget(_ramp()), scanner, fan, np.zeros(3))
+    direct = peaks_of_solid(CsgTarget(_ramp()), scanner, fan)
     return (
         scanner,
         fan,
         direct,
-        *add_bounces(CsgTarget(_ramp()), scanner, fan, np.zeros(3), y, direct),
+        *add_bounces(CsgTarget(_ramp()), scanner, fan, y, direct),
     )  # type: ignore[return-value]
 
 
@@ -89,6 +91,16 @@ def test_a_mirrored_spot_beside_the_line_pulls_the_peak() -> None:
     assert found.light[3] == pytest.approx(bright + light)
 
 
+def test_rows_count_from_the_laser_not_from_the_middle_of_the_part() -> None:
+    *_, found, mark = _measure(3.0, incidence_limit=math.radians(50.0))
+    *_, aside, other = _measure(3.0, offset=1.0, incidence_limit=math.radians(50.0))
+    np.testing.assert_array_equal(aside.ray, found.ray)
+    np.testing.assert_allclose(aside.length, found.length, atol=1e-9)
+    shifted = np.array([0.0, 1.0, 0.0])
+    np.testing.assert_allclose(aside.position - shifted, found.position, atol=1e-9)
+    np.testing.assert_array_equal(other, mark)
+
+
 def test_a_flat_part_has_no_second_spots() -> None:
     scanner = StripeScanner(specular=0.5)
     rotation = View().rotation()
@@ -97,7 +109,7 @@ def test_a_flat_part_has_no_second_spots() -> None:
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     fan = Fan(np.array([[0.0, 0.0, scanner.stand_off]]), ray @ rotation.T, rotation)
     plate = CsgTarget(box((-5, -5, -1), (5, 5, 0)))
-    direct = peaks_of_solid(plate, scanner, fan, np.zeros(3))
-    found, mark = add_bounces(plate, scanner, fan, np.zeros(3), y, direct)
+    direct = peaks_of_solid(plate, scanner, fan)
+    found, mark = add_bounces(plate, scanner, fan, y, direct)
     assert (mark == 0).all()
     np.testing.assert_array_equal(found.length, direct.length)

@@ -17,7 +17,7 @@ from scanner_sim.optics import merging, sub_rays
 from scanner_sim.part import Part, box, cone, intersection, rod, sphere, torus, union
 from scanner_sim.target import CsgTarget
 
-Peak = Callable[[CsgTarget, StripeScanner, Fan, np.ndarray], Peaks]
+Peak = Callable[[CsgTarget, StripeScanner, Fan], Peaks]
 BOTH = pytest.mark.parametrize("find", [peaks, peaks_of_solid])
 
 
@@ -56,10 +56,7 @@ def test_kernels_agree_with_casts(scanner: StripeScanner) -> None:
         half = np.abs(part.box).max()
         x = np.linspace(-half, half, 61)
         fan = _fan(part, scanner, view, x, np.linspace(-half, half, 43))
-        middle = part.box.mean(axis=0)
-        plain, kernel = (
-            find(CsgTarget(part), scanner, fan, middle) for find in (peaks, peaks_of_solid)
-        )
+        plain, kernel = (find(CsgTarget(part), scanner, fan) for find in (peaks, peaks_of_solid))
         assert len(plain.ray) > 150
         np.testing.assert_array_equal(kernel.ray, plain.ray)
         np.testing.assert_array_equal(kernel.surface, plain.surface)
@@ -96,8 +93,7 @@ def test_rows_against_one_ray_at_a_time(find: Peak) -> None:
     x = np.array([-1.3, -0.21, -0.1, 0.05, 0.17, 0.8, 0.9, 1.0, 4.9])
     y = np.array([-2.0, 0.3, 3.1])
     fan = _fan(part, scanner, View(), x, y)
-    middle = part.box.mean(axis=0)
-    found = find(CsgTarget(part), scanner, fan, middle)
+    found = find(CsgTarget(part), scanner, fan)
     offsets, shares = sub_rays(scanner)
     rows = {int(r): k for k, r in enumerate(found.ray)}
     checked = 0
@@ -129,7 +125,7 @@ def test_rows_against_one_ray_at_a_time(find: Peak) -> None:
 def test_zero_width_is_one_ray_and_exact(find: Peak) -> None:
     part = _mixed_part()
     fan = _fan(part, StripeScanner(), View(), np.linspace(-8, 8, 40), np.linspace(-6, 6, 30))
-    found = find(CsgTarget(part), StripeScanner(), fan, part.box.mean(axis=0))
+    found = find(CsgTarget(part), StripeScanner(), fan)
     source, ray = fan.source[found.ray // 30], fan.ray[found.ray % 30]
     np.testing.assert_allclose(source + found.length[:, None] * ray, found.position, atol=1e-12)
     np.testing.assert_allclose(found.light, -np.einsum("ij,ij->i", found.normal, ray), atol=1e-12)
@@ -142,7 +138,7 @@ def test_planes_are_not_bent_by_the_width(find: Peak) -> None:
     for turn in ("x", "y"):
         part = plate.turned(turn, 0.6)
         fan = _fan(part, scanner, View(), np.linspace(-2, 2, 9), np.linspace(-2, 2, 9))
-        found = find(CsgTarget(part), scanner, fan, part.box.mean(axis=0))
+        found = find(CsgTarget(part), scanner, fan)
         middle = fan.source[found.ray // 9] + found.length[:, None] * fan.ray[found.ray % 9]
         off = np.abs(np.einsum("ij,ij->i", middle - found.position, found.normal))
         assert off.max() < 5e-5  # the camera sees the near side of the line a little larger
@@ -155,7 +151,7 @@ def test_small_steps_give_points_between_their_levels(find: Peak) -> None:
     scanner = StripeScanner(line_width=0.2)
     view = View(turn=math.pi)  # the camera on the lower side
     fan = _fan(part, scanner, view, np.linspace(-0.3, 0.3, 41), np.array([0.0]))
-    found = find(CsgTarget(part), scanner, fan, part.box.mean(axis=0))
+    found = find(CsgTarget(part), scanner, fan)
     height = (fan.source[found.ray] + found.length[:, None] * fan.ray[0])[:, 2]
     x = fan.source[found.ray][:, 0]
     far = np.abs(x) > 0.1

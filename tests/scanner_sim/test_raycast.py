@@ -112,9 +112,8 @@ def test_reach_and_shadow() -> None:
     reach = 40.0 + rng.uniform(-6, 6, 600)
     expected = full.distance < reach
     assert 0 < expected.sum() < 600
-    for any_hit in (False, True):
-        hits = cast(part.flat(), origins, directions, reach, any_hit=any_hit)
-        np.testing.assert_array_equal(hits.surface >= 0, expected)
+    hits = cast(part.flat(), origins, directions, reach)
+    np.testing.assert_array_equal(hits.surface >= 0, expected)
     brute = [first_hit(part, o, d, r) for o, d, r in zip(origins, directions, reach, strict=True)]
     np.testing.assert_array_equal(np.isfinite(brute), expected)
 
@@ -130,10 +129,10 @@ def test_from_outside_the_ways_into_the_solid_are_enough(name: str) -> None:
         np.testing.assert_array_equal(one, other)
     assert (full.surface >= 0).sum() > 10
     reach = np.where(np.isfinite(full.distance), full.distance, 40.0) - 1e-3
-    hidden = cast(flat, origins, directions, reach, any_hit=True, from_outside=True)
+    hidden = cast(flat, origins, directions, reach, from_outside=True)
     assert (hidden.surface < 0).all()
     reach += 2e-3
-    hidden = cast(flat, origins, directions, reach, any_hit=True, from_outside=True)
+    hidden = cast(flat, origins, directions, reach, from_outside=True)
     np.testing.assert_array_equal(hidden.surface >= 0, full.surface >= 0)
 
 

@@ -1,0 +1,178 @@
+"""Sets of samples: the simplest surface through each, and which samples lie on a surface."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.device.linalg import row, vec3
+from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
+from octoseg_ti.device.surfaces import KINDS, surface_at
+from octoseg_ti.stages.leaves import Samples
+from octoseg_ti.stages.primitives import fit_all
+from octoseg_ti.stages.quadrics import fit_quadrics
+from octoseg_ti.stages.selection import choose, plane_does
+from octoseg_ti.types import SurfaceKind
+
+# A surface fits when its residual is below this many noises.
+_FIT = 1.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Surfaces:
+    """Analytic surfaces, ``M`` of them."""
+
+    kind: np.ndarray
+    """`SurfaceKind`, shape (M,), i32."""
+    parameters: np.ndarray
+    """As in `Segmentation.parameters`, but relative to the corner of the grid, shape (M, 8)."""
+
+    def __len__(self) -> int:
+        """Return the number of surfaces."""
+        return len(self.kind)
+
+    def joined(self, other: "Surfaces") -> "Surfaces":
+        """Return these and other surfaces."""
+        return Surfaces(
+            kind=np.concatenate([self.kind, other.kind]),
+            parameters=np.concatenate([self.parameters, other.parameters]),
+        )
+
+    def at(self, which: np.ndarray) -> "Surfaces":
+        """Return some of the surfaces."""
+        return Surfaces(kind=self.kind[which], parameters=self.parameters[which])
+
+
+def no_surfaces() -> Surfaces:
+    """Return no surface."""
+    return Surfaces(kind=np.zeros(0, np.int32), parameters=np.zeros((0, 8)))
+
+
+def joined(surfaces: list[Surfaces]) -> Surfaces:
+    """Return surfaces in one list."""
+    whole = [no_surfaces(), *surfaces]
+    return Surfaces(
+        kind=np.concatenate([s.kind for s in whole]),
+        parameters=np.concatenate([s.parameters for s in whole]),
+    )
+
+
+@ti.kernel
+def _lie_on(
+    limit: ti.f64,
+    cosine: ti.f64,
+    # In:
+    point_in: F64Rows,
+    normal_in: F64Rows,
+    sample_in: I32Array,
+    surface_in: F64Rows,
+    range_in: I32Rows,
+    # Out:
+    on_out: I32Array,
+):
+    """Say for every surface which samples of its range lie on it."""
+    for s in range(range_in.shape[0]):
+        kind = ti.cast(surface_in[s, 8], ti.i32)
+        origin = row(surface_in, s)
+        axis = vec3(surface_in[s, 3], surface_in[s, 4], surface_in[s, 5])
+        for j in range(range_in[s, 0], range_in[s, 1]):
+            i = sample_in[j]
+            d, n = surface_at(
+                kind, row(point_in, i), origin, axis, surface_in[s, 6], surface_in[s, 7]
+            )
+            m = row(normal_in, i)
+            on = ti.cast(ti.abs(d) <= limit, ti.i32)
+            if ti.abs(n.dot(m)) < cosine and m.norm_sqr() > 0.0:
+                on = 0
+            on_out[range_in[s, 2] + j - range_in[s, 0]] = on
+
+
+def lie_on(
+    samples: Samples,
+    sets: list[np.ndarray],
+    which: np.ndarray,
+    surfaces: Surfaces,
+    limit: float,
+    turn: float,
+) -> list[np.ndarray]:
+    """Return for every surface which samples of a set lie on it.
+
+    Args:
+        samples: The samples.
+        sets: Sets of samples.
+        which: The set that every surface is compared with, shape (M,).
+        surfaces: The surfaces.
+        limit: Largest distance [mm].
+        turn: Largest angle between the normals [rad].
+
+    Returns:
+        Whether each sample of the set lies on the surface, an array of bool for every surface.
+    """
+    runtime.ensure_started()
+    if len(surfaces) == 0:
+        return []
+    length = np.array([len(s) for s in sets], np.int64)
+    begin = np.cumsum(length) - length
+    out = np.cumsum(length[which]) - length[which]
+    ranges = np.stack([begin[which], begin[which] + length[which], out], axis=1).astype(np.int32)
+    on = runtime.empty(int(length[which].sum()), np.int32)
+    _lie_on(
+        limit,
+        float(np.cos(min(turn, np.pi / 2))),
+        runtime.upload(samples.point),
+        runtime.upload(samples.normal),
+        runtime.upload(np.concatenate(sets).astype(np.int32)),
+        runtime.upload(np.column_stack([surfaces.parameters, surfaces.kind])),
+        runtime.upload(ranges),
+        on,
+    )
+    found = runtime.download(on).astype(bool)
+    return [found[o : o + n] for o, n in zip(out, length[which], strict=True)]
+
+
+def spread(members: np.ndarray, most: int) -> np.ndarray:
+    """Return at most so many members, evenly spaced."""
+    if len(members) <= most:
+        return members
+    return members[(2 * np.arange(most) + 1) * len(members) // (2 * most)]
+
+
+def fit_sets(
+    samples: Samples, sets: list[np.ndarray], noise: float, *, robust: bool = False
+) -> tuple[np.ndarray, Surfaces]:
+    """Fit the simplest surface to every set of samples.
+
+    Planes come first: a set on which no curved surface could do better is fitted by no other.
+
+    Args:
+        samples: The samples.
+        sets: Sets of samples.
+        noise: Deviation of a point from its surface [mm].
+        robust: Some samples may belong to something else.
+
+    Returns:
+        Which sets have a surface, ascending, shape (M,), and these surfaces.
+    """
+    if not sets:
+        return np.zeros(0, np.int64), no_surfaces()
+    kind = np.full(len(sets), int(SurfaceKind.FREE_FORM), np.int32)
+    parameters = np.full((len(sets), 8), np.nan)
+    index, start = _in_a_row(sets)
+    flat = fit_quadrics(samples.point[index], samples.normal[index], start)
+    kind[plane_does(flat, np.diff(start), noise=noise, room=_FIT)] = int(SurfaceKind.PLANE)
+    parameters[:, :6] = np.column_stack([flat.centre, flat.normal])
+    curved = np.flatnonzero(kind >= KINDS)
+    if len(curved):
+        index, start = _in_a_row([sets[s] for s in curved])
+        fits = fit_all(
+            samples.point[index], samples.normal[index], None, start, noise=noise, robust=robust
+        )
+        chosen = choose(fits, noise=noise, room=_FIT, signed=samples.signed)
+        kind[curved], parameters[curved] = chosen.kind, chosen.parameters
+    fitted = np.flatnonzero((kind >= 0) & (kind < KINDS))
+    return fitted, Surfaces(kind=kind[fitted], parameters=parameters[fitted])
+
+
+def _in_a_row(sets: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return sets one after the other, and where each begins, with the end."""
+    return np.concatenate(sets), np.cumsum([0] + [len(s) for s in sets]).astype(np.int32)
