@@ -24,11 +24,13 @@ _WHOLE = 0.85
 _SURE = 0.9
 # Samples for one fit of a set, and of a growing surface.
 _MANY, _SOME = 200, 150
-# Neighbourhoods of a seed, in samples.
-_NEAR = (20, 60, 150)
+# Neighbourhoods of a seed, in samples; and one of less, down to this share of the smallest surface,
+# where small ones count.
+_NEAR, _LEAST_NEAR, _SHARE_NEAR = (20, 60, 150), 12, 0.6
 # Samples of a set that tell how much a candidate explains.
 _SCORED = 3000
-# Seeds of a set, and into how many looks they are divided: each looks at what is left.
+# Seeds of a set, two for the smallest surface at least, and into how many looks they are divided:
+# each looks at what is left.
 _SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS, _LOOKS = 40, 8, 200, 2
 # A surface grows until it gains less than this, at most so often.
 _GAIN, _GROWTHS = 1.02, 4
@@ -133,7 +135,9 @@ def _neighborhoods(point: np.ndarray, seeds: np.ndarray, count: int) -> np.ndarr
 class _Set:
     """A set that is taken apart: what is left of it, and its candidates."""
 
-    def __init__(self, samples: Samples, leaves: Leaves, members: np.ndarray) -> None:
+    def __init__(
+        self, samples: Samples, leaves: Leaves, members: np.ndarray, fewest: float
+    ) -> None:
         self.members = members
         self.weight = samples.weight[members]
         self.free = np.ones(len(members), bool)
@@ -144,8 +148,12 @@ class _Set:
         both = (a >= 0) & (b >= 0)
         self.a, self.b = a[both], b[both]
         self.total = np.bincount(self.place, weights=self.weight, minlength=len(self.leaf))
-        self.seeds = int(np.clip(len(members) // _SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS))
+        self.seeds = int(
+            np.clip(len(members) / min(_SEED_EVERY, fewest / 2.0), _LEAST_SEEDS, _MOST_SEEDS)
+        )
         self.each = max(self.seeds // _LOOKS, _LEAST_SEEDS)
+        least = int(max(_LEAST_NEAR, _SHARE_NEAR * fewest))
+        self.near = (least, *_NEAR) if least < _NEAR[0] else _NEAR
         self.scored = np.zeros(0, np.int64)
         self.on = np.zeros((0, 0), np.float32)
         self.surfaces = no_surfaces()
@@ -156,7 +164,7 @@ class _Set:
         seeds = spread(np.arange(len(left)), min(self.each, self.seeds))
         self.seeds -= self.each
         near: list[np.ndarray] = []
-        for count in _NEAR:
+        for count in self.near:
             near += list(left[_neighborhoods(point[left], seeds, min(count, len(left)))])
             if count >= len(left):
                 break
@@ -226,7 +234,7 @@ def _take_apart(
     """Find the surfaces of sets that no single one explains."""
     label = np.full(len(samples), NONE, np.int32)
     found = no_surfaces()
-    active = [_Set(samples, leaves, members) for members in sets]
+    active = [_Set(samples, leaves, members, tolerance.points) for members in sets]
     while active:
         _find_candidates(samples, active, tolerance)
         gained: dict[_Set, None] = {}
