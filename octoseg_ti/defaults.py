@@ -38,9 +38,12 @@ of differences of heights, so errors cancel out faster than independent ones do.
 HOMOGENEITY = (7.0, 0.1, 0.25)
 """Angle between touching cells: this many tolerances, at least and at most so many radians."""
 
-SURFACE_NOISE = (1.3, 0.005)
+SURFACE_NOISE = (1.3, 0.02)
 """A point deviates from its surface by this many standard deviations of the noise, plus so many
-spacings: surfaces are fitted to noisy points, and rounding leaves something on perfect data."""
+spacings, for surfaces are fitted to noisy points."""
+EXACT_NOISE = (0.5, 0.005)
+"""... but of the latter no more than so many standard deviations, plus so many spacings, which
+rounding leaves on perfect data."""
 TURNS = (0.25, 4.0)
 """A sample lies on a surface when its normal is off by no more than this angle [rad], or so many
 deviations of the normals."""
@@ -120,7 +123,9 @@ def derive(params: Params, measured: Measurement) -> Params:
     if surfaces.noise is None:
         times, share = SURFACE_NOISE
         noise = max(measured.noise, measured.surface_noise)
-        surfaces = replace(surfaces, noise=times * noise + share * spacing)
+        more, rounding = EXACT_NOISE
+        off = min(share * spacing, more * noise + rounding * spacing)
+        surfaces = replace(surfaces, noise=times * noise + off)
     if surfaces.tilt is None:
         surfaces = replace(surfaces, tilt=max(LEAST_TILT, measured.normal_noise))
     exact = math.sqrt(one) / surfaces.noise if one > 0 and surfaces.noise else 1.0

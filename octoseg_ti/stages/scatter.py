@@ -22,7 +22,7 @@ _FEWEST = 24
 # The points of a neighbourhood are among so many times as many in Morton order.
 _WINDOW = 4
 # The median counts, up to so many times the lower quartile: edges may run through most.
-_CALM, _MIDDLE, _EDGES = 0.25, 0.5, 1.5
+_CALM, _MIDDLE, _EDGES = 0.25, 0.6, 1.5
 # A quadric is no surface any more where it turns by so much from the middle to the rim [rad].
 _BEND = 0.35
 # Where it leaves so many times what it leaves of the calm ones, there is an edge.
