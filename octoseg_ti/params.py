@@ -89,6 +89,10 @@ class EdgeParams:
     """Rule "levels": how many of these sizes, from the largest down, are fillets."""
     radius: float = 1.0
     """Rule "radius": smallest radius that is still a patch [mm]; s = sqrt(12) tolerance radius."""
+    fillet_radius: float = 3.0
+    """Largest radius of a fillet [mm], with analytic surfaces: a strip that touches its neighbours
+    on both sides stands for an edge up to this radius, and for a patch beyond it; 0 = no fillets.
+    """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from octoseg_ti.arrange import Arranged
+from octoseg_ti.borders import Borders
 from octoseg_ti.defaults import spacing_of
 from octoseg_ti.device import runtime
 from octoseg_ti.device.surfaces import evaluate_surfaces
@@ -21,6 +22,7 @@ from octoseg_ti.stages.assignment import (
 )
 from octoseg_ti.stages.bends import split_at_bends
 from octoseg_ti.stages.grid import Grid
+from octoseg_ti.stages.leaves import Leaves
 from octoseg_ti.stages.moments import LEVEL, NORMAL, SIGMA, STOP, X, Z
 from octoseg_ti.stages.planes import fit_planes
 from octoseg_ti.stages.regions import flood_fill, number_groups, strips
@@ -28,6 +30,7 @@ from octoseg_ti.types import (
     NONE,
     Cells,
     EdgeClass,
+    Fillets,
     Measurement,
     Scans,
     Segmentation,
@@ -70,6 +73,8 @@ class Regions:
     """`SurfaceKind` of every such surface."""
     parameters: np.ndarray | None = None
     """Parameters of every such surface, relative to the corner of the grid."""
+    graph: Leaves | None = None
+    """The leaves as a graph, when surfaces were looked for."""
 
 
 def grow_regions(
@@ -174,6 +179,7 @@ def assemble(
     grid: Grid,
     leaves: np.ndarray,
     found: Regions,
+    borders: Borders | None,
     measured: Measurement,
     params: Params,
 ) -> Segmentation:
@@ -209,13 +215,46 @@ def assemble(
         label=name[found.cell_label[leaves]],
         initial_size=grid.size,
     )
+    edge, fillets = rows.edge, None
+    if borders is not None:
+        edge, fillets = _fillets(borders, arranged.row[runtime.download(grid.order)], n, name, rank)
     return Segmentation(
-        points=rows.points, normals=rows.normals, labels=rows.labels, edge=rows.edge,
+        points=rows.points, normals=rows.normals, labels=rows.labels, edge=edge, fillets=fillets,
         level=rows.level, outlier=outlier, kind=kind[rank],
         surface=_renumbered(surface[rank]), parameters=parameters[rank], residual=residual[rank],
         cells=cells, stripe=scans.stripe, view=scans.view, params=params, measured=measured,
         passes=grid.passes, name=scans.name,
     )  # fmt: skip
+
+
+def _fillets(
+    borders: Borders, row: np.ndarray, rows: int, name: np.ndarray, rank: np.ndarray
+) -> tuple[np.ndarray, Fillets]:
+    """Return the edge class of every row, and the fillets by the number of their points.
+
+    Args:
+        borders: The edges of the sorted points.
+        row: Row of every sorted point.
+        rows: Number of rows N.
+        name: Patch of every region, shape (K + 1,).
+        rank: Region of every patch, shape (K,).
+    """
+    edge, point = np.zeros(rows, np.uint8), np.full(rows, NONE, np.int32)
+    edge[row] = borders.edge
+    size = np.bincount(borders.fillet[borders.fillet >= 0], minlength=len(borders.radius))
+    order = np.argsort(-size, kind="stable")
+    number = np.full(len(size) + 1, NONE, np.int32)
+    number[order] = np.arange(len(size), dtype=np.int32)
+    point[row] = number[borders.fillet]
+    return edge, Fillets(
+        patches=np.sort(name[borders.sides[order]], axis=1),
+        radius=np.abs(borders.radius[order]),
+        deviation=borders.deviation[order],
+        concave=(borders.radius[order] > 0.0).astype(np.uint8),
+        points=size[order].astype(np.int32),
+        strip=number[borders.strip[rank]],
+        point=point,
+    )
 
 
 def _describe(

@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 
 from octoseg_ti.arrange import Arranged, arrange, as_scans, without
-from octoseg_ti.defaults import derive
+from octoseg_ti.borders import Borders, find_borders
+from octoseg_ti.defaults import derive, spacing_of
 from octoseg_ti.device import runtime
 from octoseg_ti.device.profiling import Trace
 from octoseg_ti.params import Params, SurfaceParams, preset_params
 from octoseg_ti.patches import Regions, assemble, grow_regions
 from octoseg_ti.stages.cleaning import mark_outliers
 from octoseg_ti.stages.edges import edges_by_level, edges_by_radius, edges_by_reason
+from octoseg_ti.stages.extraction import Surfaces
 from octoseg_ti.stages.filtering import filter_normals, independent_lag, square_lag
 from octoseg_ti.stages.grid import Grid, build_grid
 from octoseg_ti.stages.measure import stripe_noise, stripe_roughness, stripe_spacing
@@ -30,7 +32,7 @@ from octoseg_ti.types import Measurement, Registration, Scans, Segmentation
 
 STAGES = (
     "cleaning", "normals", "registration", "measure", "grid", "edges", "regions", "surfaces",
-    "patches",
+    "borders", "patches",
 )  # fmt: skip
 """The stages, in order."""
 
@@ -104,8 +106,12 @@ def segment(
         measured, params, found = explain_regions(
             grid, leaves, found, measured, params, asked, curved=curved
         )
+    with stage("borders"):
+        borders = trace_borders(grid, found, measured, params)
     with stage("patches"):
-        result = assemble(scans, arranged, point, normal, grid, leaves, found, measured, params)
+        result = assemble(
+            scans, arranged, point, normal, grid, leaves, found, borders, measured, params
+        )
     if aligned is not None:
         result = with_registration(result, scans, aligned)
     return replace(result, seconds=trace.seconds)
@@ -332,6 +338,27 @@ def explain_regions(
             measured = replace(measured, noise=min(measured.noise, scatter))
     params = derive(replace(params, surfaces=asked), measured)
     return measured, params, fit_surfaces(grid, leaves, found, params)
+
+
+def trace_borders(
+    grid: Grid, found: Regions, measured: Measurement, params: Params
+) -> Borders | None:
+    """Find the edges between patches, and the fillets, by their surfaces."""
+    if found.graph is None or found.count == 0 or params.edges.rule != "reason":
+        return None
+    assert found.surface is not None and found.kind is not None and found.parameters is not None
+    assert params.surfaces.noise is not None
+    return find_borders(
+        grid.point,
+        grid.normal,
+        found.graph,
+        found.label,
+        found.surface,
+        Surfaces(kind=found.kind, parameters=found.parameters),
+        noise=params.surfaces.noise,
+        spacing=spacing_of(measured),
+        limit=params.edges.fillet_radius,
+    )
 
 
 def find_edges(grid: Grid, params: Params) -> tuple[np.ndarray, np.ndarray]:

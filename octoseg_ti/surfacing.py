@@ -18,21 +18,20 @@ from octoseg_ti.patches import Regions
 from octoseg_ti.stages.extraction import Tolerance, explain
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import (
-    Choice,
+    Labelling,
     Rule,
     common_label,
     label_lists,
-    label_points,
     own_lists,
     surface_table,
 )
 from octoseg_ti.stages.leaves import Leaves, Samples, leaf_graph, sample_leaves
 from octoseg_ti.stages.merging import (
-    contacts,
     explained_by_others,
     members_of,
     merge_surfaces,
     pieces,
+    smooth_contacts,
 )
 from octoseg_ti.stages.sets import Surfaces, fit_sets, lie_on, no_surfaces, spread
 from octoseg_ti.types import NONE
@@ -77,11 +76,13 @@ class _Search:
     """What the rounds of the search share."""
 
     def __init__(self, grid: Grid, leaves: Leaves, tolerance: Tolerance, rule: Rule) -> None:
-        self.grid, self.leaves, self.tolerance, self.rule = grid, leaves, tolerance, rule
+        self.grid, self.leaves, self.tolerance = grid, leaves, tolerance
         self.samples = sample_leaves(grid, leaves, _SAMPLES)
         self.surfaces = no_surfaces()
         self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
-        self.choice: Choice | None = None
+        self.labelling = Labelling(grid, leaves, rule)
+        # Pairs of surfaces that were found not to be one.
+        self.apart = np.zeros(0, np.int64)
         # Surfaces found in what others left have to be clearly better where others fit.
         self.early = 0
         # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut
@@ -92,16 +93,13 @@ class _Search:
     @property
     def label(self) -> np.ndarray:
         """Return the label of every sorted point."""
-        assert self.choice is not None
-        return runtime.download(self.choice.label)
+        return runtime.download(self.labelling.choice.label)
 
     def choose(self, passes: int = 1) -> None:
         """Let the points choose among the surfaces that have points near them."""
         late = np.arange(len(self.surfaces)) >= self.early
         table = surface_table(self.surfaces.kind, self.surfaces.parameters, _HANDICAP * late)
-        self.choice, self.own = label_points(
-            self.grid, self.leaves, self.own, table, self.rule, passes=passes, closed=self.free
-        )
+        self.own = self.labelling.choose(self.own, table, passes=passes, closed=self.free)
 
     def add(
         self,
@@ -202,23 +200,30 @@ class _Search:
     def merge(self) -> bool:
         """Merge surfaces that are one; say whether there were any."""
         label = self.label[self.samples.index]
-        pairs, _ = contacts(self.leaves, self.own)
+        pairs = smooth_contacts(self.leaves, self.own, self.samples, self.surfaces)
+        key = pairs[:, 0] * len(self.surfaces) + pairs[:, 1]
         name, self.surfaces = merge_surfaces(
-            self.samples, label, self.surfaces, pairs, self.tolerance.noise
+            self.samples,
+            label,
+            self.surfaces,
+            pairs[~np.isin(key, self.apart)],
+            self.tolerance.noise,
         )
-        if np.array_equal(name, np.arange(len(name))):
+        changed = name != np.arange(len(name))
+        if not changed.any():
             return False
+        changed[name[changed]] = True
+        self.apart = key[~changed[pairs].any(axis=1)]
         self.rename(name)
         self.choose()
         return True
 
     def give_up(self) -> bool:
         """Give up surfaces that their neighbours explain; say whether there were any."""
-        assert self.choice is not None
         gone = explained_by_others(
             self.label,
-            runtime.download(self.choice.second),
-            runtime.download(self.choice.off),
+            runtime.download(self.labelling.choice.second),
+            runtime.download(self.labelling.choice.off),
             len(self.surfaces),
             _EXPLAINED,
         )
@@ -326,8 +331,10 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         )
         loose = rule._replace(reach=_LOOSE * rule.reach, turn=float(np.pi))
         own = label_lists(graph, np.where(label < len(surface), label, NONE))
-        choice, _ = label_points(grid, graph, own, table, loose)
-        label = np.where(label < 0, runtime.download(choice.label), label)
+        labelling = Labelling(grid, graph, loose)
+        full = ~np.logical_or.reduceat(label < 0, graph.first)
+        labelling.choose(own, table, closed=full)
+        label = np.where(label < 0, runtime.download(labelling.choice.label), label)
     held = np.full(grid.count, NONE, np.int32)
     held[leaves] = common_label(graph, label)
     return replace(
@@ -338,6 +345,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         surface=np.concatenate([surface, np.full(len(stay), NONE, np.int32)]),
         kind=surfaced.surfaces.kind,
         parameters=surfaced.surfaces.parameters,
+        graph=graph,
     )
 
 
@@ -359,8 +367,10 @@ def number_pieces(
     leaf = np.repeat(np.arange(len(leaves)), leaves.count)
     there = found.label >= 0
     cell, name = leaf[there], found.label[there]
-    rank = (found.own[cell] == name[:, None]).argmax(axis=1)
-    mine = piece[cell, rank]
+    mine = piece[cell, 0]
+    others = np.flatnonzero(found.own[cell, 0] != name)
+    rank = (found.own[cell[others]] == name[others, None]).argmax(axis=1)
+    mine[others] = piece[cell[others], rank]
     size = np.bincount(mine)
     most = np.zeros(len(found.surfaces), np.int64)
     np.maximum.at(most, name, size[mine])
@@ -372,7 +382,4 @@ def number_pieces(
     number[names] = np.arange(len(names), dtype=np.int32)
     label = np.full(len(found.label), NONE, np.int32)
     label[there] = number[mine]
-    surface = np.zeros(len(names), np.int32)
-    kept = label[there] >= 0
-    surface[label[there][kept]] = name[kept]
-    return label, surface
+    return label, found.own[found.own >= 0][names]  # pieces are named by an entry of the lists

@@ -281,6 +281,35 @@ def _listed(views: np.ndarray) -> str:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fillets:
+    """The fillets of a part: strips that a ball leaves that rolls along two patches; ``F`` of them.
+
+    The points of a strip keep the label that they have, that of a patch of their own where the
+    strip is wide enough to be one; `strip` tells which patches are strips. A corner where several
+    fillets meet may be a fillet of its own, between one fillet and the next patch.
+    """
+
+    patches: np.ndarray
+    """The two patches that a fillet runs between, shape (F, 2), i32."""
+    radius: np.ndarray
+    """Radius of the ball [mm], shape (F,), f64."""
+    deviation: np.ndarray
+    """Standard deviation of the radius [mm], shape (F,), f64."""
+    concave: np.ndarray
+    """1 where the fillet fills a corner, 0 where it rounds an edge, shape (F,), u8."""
+    points: np.ndarray
+    """Points on the fillet, shape (F,), i32."""
+    strip: np.ndarray
+    """Fillet that every patch is a strip of, -1 = it is no strip, shape (K,), i32."""
+    point: np.ndarray
+    """Fillet that every point lies on, -1 = none, shape (N,), i32."""
+
+    def __len__(self) -> int:
+        """Return the number of fillets."""
+        return len(self.radius)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Segmentation:
     """The answer of `segment`, in the order of the input points."""
 
@@ -316,6 +345,8 @@ class Segmentation:
     """The parameters, with every value that was left open filled in."""
     measured: Measurement
     """What was measured on the data."""
+    fillets: Fillets | None = None
+    """Fillets and their radii; None when they were not looked for."""
     registration: Registration | None = None
     """How the views were aligned; None when the recorded poses were used as they are."""
     passes: int
@@ -365,6 +396,11 @@ class Segmentation:
             lines.append(f"  patch {k}: {kind}, {sizes[k]} points{rms}")
         if self.patch_count > 12:
             lines.append(f"  ... and {self.patch_count - 12} smaller ones")
+        if self.fillets is not None and len(self.fillets):
+            radius = self.fillets.radius
+            lines.append(
+                f"  {len(radius)} fillets, radius {radius.min():.3g} to {radius.max():.3g} mm"
+            )
         if self.seconds:
             stages = ", ".join(f"{name} {1e3 * s:.1f}" for name, s in self.seconds.items())
             lines.append(f"  milliseconds: {stages}")

@@ -37,7 +37,7 @@ _GAIN, _GROWTHS = 1.02, 4
 _LEFT = 0.005
 # Candidates that explain this share of what the best one does grow together with it, and are
 # taken together when so much of them is left by the larger ones.
-_TOGETHER, _KEPT = 0.25, 0.8
+_TOGETHER, _KEPT = 0.5, 0.8
 # Surfaces that a set was taken apart into are real when they explain so much of it, and leave no
 # more than so many noises, fewer the less they explain and the more of it neighbours share: pieces
 # of a free form are cut out as far as they just fit, and leave gaps and waves.

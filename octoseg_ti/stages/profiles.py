@@ -1,0 +1,288 @@
+"""The profile across the edge of two surfaces: sharp, or rounded by a ball that rolls along both.
+
+Two analytic surfaces and a signed radius describe a whole edge. The ball touches both surfaces, so
+its centre is as far from either, on the side of the material (a convex edge, radius below 0) or of
+the air (a concave one, above 0). Newton's steps find the centre that belongs to a point. Between
+the two lines of contact the ball is the surface, beyond them the surfaces are. Radius 0 is the
+sharp edge. So plane and plane give a cylinder, plane and cylinder a torus, and nothing has to be
+said about either; tangency is built in, and one number is left to estimate.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.device.linalg import row, vec3
+from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, ti
+from octoseg_ti.device.surfaces import surface_at
+
+BALL, FIRST, SECOND, NOWHERE = 0, 1, 2, 3
+"""Where a point lies on a profile: between the lines of contact, beyond the first or the second
+line, or there is no edge near it."""
+
+_STEPS = 4
+_CLOSE, _FAR = (
+    1e-6,
+    1e-3,
+)  # a centre is found when so near its distances [mm]; it is none so far off
+_PARALLEL = 1e-6  # squared sine of the angle between surfaces below which they have no edge
+
+_SHARP = 1e-9  # a smaller radius is none [mm]
+
+vec9 = ti.types.vector(9, ti.f64)
+
+
+class Places(NamedTuple):
+    """Where points lie on the profiles of edges, one entry a point and edge."""
+
+    off: np.ndarray
+    """Distance from the profile [mm], positive in the air, f64."""
+    along: np.ndarray
+    """Distance from the nearer line of contact, along the surface [mm]; 0 between the lines of a
+    round edge. Infinite where there is no edge near."""
+    region: np.ndarray
+    """BALL, FIRST, SECOND or NOWHERE, i32."""
+    turn: np.ndarray
+    """Angle by which the surface turns from one side of the edge to the other [rad]."""
+    cosine: np.ndarray
+    """Cosine of the angle between the normals of the point and of the profile."""
+    height: np.ndarray
+    """Heights above both surfaces, added up [mm]: above 0 = a concave edge."""
+
+
+@ti.func
+def _side_at(surface_in: ti.template(), s: ti.i32, p: vec3):
+    """Return (height of a point above a surface, its normal there), on the side of the air."""
+    axis = vec3(surface_in[s, 3], surface_in[s, 4], surface_in[s, 5])
+    d, n = surface_at(
+        ti.cast(surface_in[s, 8], ti.i32), p, row(surface_in, s), axis, surface_in[s, 6],
+        surface_in[s, 7],
+    )  # fmt: skip
+    side = surface_in[s, 9]
+    return side * d, side * n
+
+
+@ti.func
+def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, radius: ti.f64,
+                     hollow: ti.f64) -> vec9:  # fmt: skip
+    """Return (off, along, region, cosine of the turn, change of off, normal (3), height).
+
+    The change is that with the radius; the height is the sum of the heights above both surfaces.
+
+    The normal is that of the profile at the point, zero where there is none.
+
+    Args:
+        surface_in: Surfaces as rows of parameters (8), kind, side.
+        a: The first surface.
+        b: The second one.
+        p: The point.
+        radius: Radius of the ball [mm], 0 or more.
+        hollow: 1 for a concave edge, -1 for a convex one.
+    """
+    c = p
+    signed = hollow * radius
+    ca, ma = _side_at(surface_in, a, p)
+    cb, mb = _side_at(surface_in, b, p)
+    da = ca
+    db = cb
+    step = 0
+    while step < _STEPS and ti.abs(ca - signed) + ti.abs(cb - signed) > _CLOSE:
+        g = ma.dot(mb)
+        det = 1.0 - g * g
+        step += 1
+        if det > _PARALLEL:
+            x = signed - ca
+            y = signed - cb
+            c += ((x - g * y) / det) * ma + ((y - g * x) / det) * mb
+            ca, ma = _side_at(surface_in, a, c)
+            cb, mb = _side_at(surface_in, b, c)
+        else:
+            step = _STEPS
+    off = da
+    if ti.abs(db) < ti.abs(da):
+        off = db
+    result = vec9(off, ti.math.inf, ti.cast(NOWHERE, ti.f64), 1.0, 0.0, 0.0, 0.0, 0.0, da + db)
+    g = ma.dot(mb)
+    det = 1.0 - g * g
+    if det > _PARALLEL and ti.abs(ca - signed) + ti.abs(cb - signed) < _FAR:
+        u = p - c
+        x = -hollow * u.dot(ma)
+        y = -hollow * u.dot(mb)
+        toward_a = (x - g * y) / det
+        toward_b = (y - g * x) / det
+        size = u.norm()
+        change = 0.0
+        region = BALL
+        along = 0.0
+        normal = vec3(0.0, 0.0, 0.0)
+        if toward_a >= 0.0 and toward_b >= 0.0:
+            off = -hollow * (size - radius)
+            if radius < _SHARP:
+                along = size
+                off = -hollow * size
+            if size > 0.0:
+                normal = (-hollow / size) * u
+                change = hollow * (1.0 + hollow * u.dot(ma + mb) / (size * (1.0 + g)))
+        elif toward_a >= toward_b:
+            region = FIRST
+            normal = ma
+            off = da
+            along = (u + (hollow * x) * ma).norm()
+        else:
+            region = SECOND
+            normal = mb
+            off = db
+            along = (u + (hollow * y) * mb).norm()
+        result = vec9(
+            off, along, ti.cast(region, ti.f64), g, change, normal[0], normal[1], normal[2], da + db
+        )
+    return result
+
+
+@ti.kernel
+def _place(
+    entries: ti.i32,
+    # In:
+    point_in: F64Rows,
+    normal_in: F64Rows,
+    surface_in: F64Rows,
+    pair_in: I32Rows,
+    radius_in: F64Array,
+    entry_in: I32Rows,
+    # Out:
+    place_out: F64Rows,
+):
+    """Place the point of every entry on the profile of its edge."""
+    for e in range(entries):
+        m = entry_in[e, 1]
+        radius = ti.abs(radius_in[m])
+        hollow = ti.select(radius_in[m] < 0.0, -1.0, 1.0)
+        f = place_on_profile(
+            surface_in, pair_in[m, 0], pair_in[m, 1], row(point_in, entry_in[e, 0]), radius, hollow
+        )
+        for k in ti.static(range(4)):
+            place_out[e, k] = f[k]
+        place_out[e, 4] = vec3(f[5], f[6], f[7]).dot(row(normal_in, entry_in[e, 0]))
+        place_out[e, 5] = f[8]
+
+
+@ti.kernel
+def _sum_up(
+    tasks: ti.i32,
+    cap: ti.f64,
+    # In:
+    point_in: F64Rows,
+    surface_in: F64Rows,
+    task_in: I32Rows,
+    shape_in: F64Rows,
+    entry_in: I32Array,
+    # Out:
+    sum_out: F64Rows,
+):
+    """Sum capped squares, gradient, curvature and points on the ball over the points of a task."""
+    for t in range(tasks):
+        cost = 0.0
+        gradient = 0.0
+        curvature = 0.0
+        count = 0.0
+        for j in range(task_in[t, 2], task_in[t, 3]):
+            f = place_on_profile(
+                surface_in, task_in[t, 0], task_in[t, 1], row(point_in, entry_in[j]),
+                shape_in[t, 0], shape_in[t, 1],
+            )  # fmt: skip
+            off = f[0]
+            if ti.abs(off) < cap:
+                cost += off * off
+                if ti.cast(f[2], ti.i32) == BALL:
+                    gradient += off * f[4]
+                    curvature += f[4] * f[4]
+                    count += 1.0
+            else:
+                cost += cap * cap
+        sum_out[t, 0] = cost
+        sum_out[t, 1] = gradient
+        sum_out[t, 2] = curvature
+        sum_out[t, 3] = count
+
+
+def place(
+    points: Any,
+    normals: Any,
+    surfaces: np.ndarray,
+    pairs: np.ndarray,
+    radius: np.ndarray,
+    point: np.ndarray,
+    edge: np.ndarray,
+) -> Places:
+    """Return where points lie on the profiles of edges.
+
+    Args:
+        points: Positions [mm], shape (n, 3) (kernel array).
+        normals: Normals, shape (n, 3) (kernel array).
+        surfaces: Surfaces as rows of parameters (8), kind, side: 1 where the outward normal points
+            into the air, else -1; shape (M, 10).
+        pairs: The two surfaces of every edge, shape (P, 2).
+        radius: Signed radius of every edge [mm], above 0 = concave, shape (P,).
+        point: Point of every entry, shape (E,).
+        edge: Edge of every entry, shape (E,).
+    """
+    runtime.ensure_started()
+    entries = len(point)
+    if entries == 0:
+        none = np.zeros(0)
+        return Places(none, none, np.zeros(0, np.int32), none, none, none)
+    out = runtime.empty((entries, 6), np.float64)
+    _place(
+        entries,
+        points,
+        normals,
+        runtime.upload(surfaces),
+        runtime.upload(pairs.astype(np.int32)),
+        runtime.upload(radius.astype(np.float64)),
+        runtime.upload(np.column_stack([point, edge]).astype(np.int32)),
+        out,
+    )
+    found = runtime.download(out)
+    turn = np.arccos(np.clip(found[:, 3], -1.0, 1.0))
+    region = found[:, 2].astype(np.int32)
+    return Places(found[:, 0], found[:, 1], region, turn, found[:, 4], found[:, 5])
+
+
+def sums(
+    points: Any,
+    surfaces: np.ndarray,
+    task: np.ndarray,
+    shape: np.ndarray,
+    entry: np.ndarray,
+    cap: float,
+) -> np.ndarray:
+    """Return how well profiles fit.
+
+    Args:
+        points: Positions [mm], shape (n, 3) (kernel array).
+        surfaces: As for `place`.
+        task: First surface, second surface, first and last entry of every task, shape (T, 4).
+        shape: Radius [mm] and 1 for concave, -1 for convex, shape (T, 2).
+        entry: Points, listed for tasks, shape (E,).
+        cap: Distances beyond this count as this [mm].
+
+    Returns:
+        Shape (T, 4): sum of the squares of distances [mm^2], half its gradient and curvature with
+        respect to the radius, and the points between the lines of contact.
+    """
+    runtime.ensure_started()
+    if len(task) == 0:
+        return np.zeros((0, 4))
+    out = runtime.empty((len(task), 4), np.float64)
+    _sum_up(
+        len(task),
+        cap,
+        points,
+        runtime.upload(surfaces),
+        runtime.upload(task.astype(np.int32)),
+        runtime.upload(shape.astype(np.float64)),
+        runtime.upload(entry.astype(np.int32)),
+        out,
+    )
+    return runtime.download(out)
