@@ -42,9 +42,9 @@ _TOGETHER, _KEPT = 0.5, 0.8
 # more than so many noises, fewer the less they explain and the more of it neighbours share: pieces
 # of a free form are cut out as far as they just fit, and leave gaps and waves.
 _COVERED, _REAL = 0.6, 1.75
-# ... and at any rate when they leave no more than this many: what is cut out as far as it just fits
-# leaves half of its reach.
-_EXACT = 0.5
+# ... and at any rate when this share of them is nearer than so many noises: of noise that is half,
+# of what is cut out as far as it just fits a sixth.
+_EXACT, _MOSTLY = 0.5, 0.75
 
 
 class Tolerance(NamedTuple):
@@ -275,9 +275,8 @@ def _real_ones(
         product, square = far[1:][pair] * far[:-1][pair], far[1:][pair] ** 2
         shared = max(0.0, float(product.sum()) / max(float(square.sum()), 1e-300))
         real[name] = covered >= _COVERED and (1.0 + shared) * rms <= covered * _REAL * noise
-        ids, rank = np.unique(name, return_inverse=True)
-        each = np.sqrt(np.bincount(rank, weight * far**2) / np.bincount(rank, weight))
-        real[ids[each <= _EXACT * noise]] = True
+        near = np.bincount(name, weight * (np.abs(far) <= _EXACT * noise), len(found))
+        real[:-1] |= near > _MOSTLY * np.maximum(np.bincount(name, weight, len(found)), 1e-300)
     kept = np.flatnonzero(real[:-1])
     number = np.full(len(real), NONE, np.int32)
     number[kept] = np.arange(len(kept), dtype=np.int32)
