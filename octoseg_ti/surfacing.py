@@ -52,6 +52,8 @@ _INNER = 40
 # A surface is given up when its neighbours explain its points with this mean square, in noises.
 _EXPLAINED = 2.0
 _MERGES = 3
+# Positions are exact when their noise is this part of the smallest cell: a hundredth of the spacing.
+_EXACT = 180.0
 # By how much the cost of a surface found late must be lower, in squares of noises.
 _HANDICAP = 2.0
 # A free form has at least this many times the points of the smallest patch.
@@ -308,11 +310,18 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
     least = params.regions.min_points
     assert noise is not None and tilt is not None and turn is not None
     assert fewest is not None and least is not None
+    assert params.grid.min_cell is not None
+    exact = params.grid.min_cell > _EXACT * noise
     graph = leaf_graph(grid, leaves.astype(np.int32), found.touching)
     rule = Rule(noise, tilt)
     rule = rule._replace(turn=max(rule.turn, _NARROW * turn))
     surfaced = find_surfaces(
-        grid, graph, found.group[leaves], found.cut[leaves], Tolerance(noise, turn, fewest), rule
+        grid,
+        graph,
+        found.group[leaves],
+        found.cut[leaves],
+        Tolerance(noise, turn, fewest, exact),
+        rule,
     )
     label, surface = number_pieces(graph, surfaced, least, fewest)
     # Regions of which surfaces explain less than half stay; they are free forms.
