@@ -41,7 +41,7 @@ HOMOGENEITY = (7.0, 0.1, 0.25)
 SURFACE_NOISE = (1.3, 0.02)
 """A point deviates from its surface by this many standard deviations of the noise, plus so many
 spacings, for surfaces are fitted to noisy points."""
-EXACT_NOISE = (0.5, 0.005)
+EXACT_NOISE = (0.5, 0.002)
 """... but of the latter no more than so many standard deviations, plus so many spacings, which
 rounding leaves on perfect data."""
 TURNS = (0.25, 4.0)

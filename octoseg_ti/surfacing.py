@@ -43,6 +43,9 @@ _SAMPLES, _REST = 4, 6
 _AROUND, _HARDLY = 12, 1e-3
 # The normals of narrow faces, and of points at edges, may be off so many times more than others.
 _NARROW = 2.0
+# ... where positions are so exact that a surface needs no more than this share of the points of a
+# patch: they tell by themselves.
+_ALONE = 0.5
 # A leaf takes part in a new group when so many of its points fit nothing, or one in so many.
 _LEFT_POINTS, _LEFT_SHARE = 2, 3
 # Samples for fitting a surface anew.
@@ -52,8 +55,6 @@ _INNER = 40
 # A surface is given up when its neighbours explain its points with this mean square, in noises.
 _EXPLAINED = 2.0
 _MERGES = 3
-# Positions are exact when their noise is this part of the smallest cell: a hundredth of the spacing.
-_EXACT = 180.0
 # By how much the cost of a surface found late must be lower, in squares of noises.
 _HANDICAP = 2.0
 # A free form has at least this many times the points of the smallest patch.
@@ -244,6 +245,8 @@ def find_surfaces(
     cut: np.ndarray,
     tolerance: Tolerance,
     rule: Rule,
+    *,
+    narrow: bool,
 ) -> Surfaced:
     """Find the analytic surfaces of a part, and the surface of every point.
 
@@ -255,6 +258,7 @@ def find_surfaces(
             a group is no sum of surfaces: each of its faces may still be one.
         tolerance: What counts as lying on a surface.
         rule: What a point may differ from the surface that it takes.
+        narrow: Positions are so exact that they tell narrow faces, whose normals do not.
     """
     search = _Search(grid, leaves, tolerance, rule)
     samples = search.samples
@@ -273,7 +277,7 @@ def find_surfaces(
             break
     else:
         search.choose(passes=2)
-    rest, sets = search.rest(around=True)
+    rest, sets = search.rest(around=True) if narrow else (rest, [])
     # Normals of narrow faces are those of the faces beside them.
     if sets and search.add(rest, sets, turn=_NARROW * tolerance.turn):
         search.choose(passes=2)
@@ -310,19 +314,15 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
     least = params.regions.min_points
     assert noise is not None and tilt is not None and turn is not None
     assert fewest is not None and least is not None
-    assert params.grid.min_cell is not None
-    exact = params.grid.min_cell > _EXACT * noise
     graph = leaf_graph(grid, leaves.astype(np.int32), found.touching)
     rule = Rule(noise, tilt)
-    rule = rule._replace(turn=max(rule.turn, _NARROW * turn))
+    exact = fewest <= _ALONE * least
+    if exact:
+        rule = rule._replace(turn=max(rule.turn, _NARROW * turn))
     surfaced = find_surfaces(
-        grid,
-        graph,
-        found.group[leaves],
-        found.cut[leaves],
-        Tolerance(noise, turn, fewest, exact),
-        rule,
-    )
+        grid, graph, found.group[leaves], found.cut[leaves],
+        Tolerance(noise, turn, fewest, exact), rule, narrow=exact,
+    )  # fmt: skip
     label, surface = number_pieces(graph, surfaced, least, fewest)
     # Regions of which surfaces explain less than half stay; they are free forms.
     rest = (label < 0) & (found.label >= 0)
