@@ -105,12 +105,16 @@ def mark_points(
     smooth = ~chosen & (smooth_pairs(search, zones.pairs, fit.turn) | (fit.points < 5))
     idle = ~chosen & (strip[zones.pairs] >= 0).any(axis=1) & smooth
     # The leaves of the zones, and those that touch them.
-    around = np.diff(leaves.start)[zones.leaf]
-    beside = leaves.neighbor[ranges(leaves.start[zones.leaf], around)]
+    more = ~smooth[zones.pair]
+    near_pair, near_leaf = zones.pair[more].astype(np.int64), zones.leaf[more]
+    around = np.diff(leaves.start)[near_leaf]
+    beside = leaves.neighbor[ranges(leaves.start[near_leaf], around)]
     key = np.concatenate(
-        [zones.pair.astype(np.int64) * len(leaves) + zones.leaf,
-         np.repeat(zones.pair.astype(np.int64), around) * len(leaves) + beside]
-    )  # fmt: skip
+        [
+            zones.pair.astype(np.int64) * len(leaves) + zones.leaf,
+            np.repeat(near_pair, around) * len(leaves) + beside,
+        ]
+    )
     key = np.unique(key)
     pair, leaf = key // len(leaves), key % len(leaves)
     pair, leaf = pair[~idle[pair]], leaf[~idle[pair]]
