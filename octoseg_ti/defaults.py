@@ -128,6 +128,7 @@ def derive(params: Params, measured: Measurement) -> Params:
         surfaces = replace(surfaces, noise=times * noise + off)
     if surfaces.tilt is None:
         surfaces = replace(surfaces, tilt=max(LEAST_TILT, measured.normal_noise))
+    assert surfaces.tilt is not None and regions.min_points is not None
     exact = math.sqrt(one) / surfaces.noise if one > 0 and surfaces.noise else 1.0
     if surfaces.turn is None:
         times, deviations = TURNS
