@@ -42,8 +42,8 @@ _TOGETHER, _KEPT = 0.5, 0.8
 # more than so many noises, fewer the less they explain and the more of it neighbours share: pieces
 # of a free form are cut out as far as they just fit, and leave gaps and waves.
 _COVERED, _REAL = 0.6, 1.75
-# ... and, where positions are exact, when this share of them is nearer than so many noises: of noise
-# that is half, of what is cut out as far as it just fits a sixth.
+# ... and, where positions are exact, when this share of them is nearer than so many noises: of
+# noise that is half, of what is cut out as far as it just fits a sixth.
 _EXACT, _MOSTLY = 0.5, 0.75
 
 

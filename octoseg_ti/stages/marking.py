@@ -7,7 +7,6 @@ from octoseg_ti.device.linalg import row
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.stages.leaves import Leaves
 
-
 # What is near is not reached by way of a leaf that is farther off than this share of the reach,
 # squared: its box is that of its points, which leave some of its cell free.
 _ASIDE = 2.25
