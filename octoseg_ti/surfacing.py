@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from octoseg_ti.defaults import TURNS
 from octoseg_ti.device import runtime
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.params import Params
@@ -19,21 +18,20 @@ from octoseg_ti.patches import Regions
 from octoseg_ti.stages.extraction import Tolerance, explain
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import (
-    Choice,
+    Labelling,
     Rule,
     common_label,
     label_lists,
-    label_points,
     own_lists,
     surface_table,
 )
 from octoseg_ti.stages.leaves import Leaves, Samples, leaf_graph, sample_leaves
 from octoseg_ti.stages.merging import (
-    contacts,
     explained_by_others,
     members_of,
     merge_surfaces,
     pieces,
+    smooth_contacts,
 )
 from octoseg_ti.stages.sets import Surfaces, fit_sets, lie_on, no_surfaces, spread
 from octoseg_ti.types import NONE
@@ -41,8 +39,15 @@ from octoseg_ti.types import NONE
 _ROUNDS = 2
 # Points of a leaf that speak for it: of all its points, and of those that fit nothing.
 _SAMPLES, _REST = 4, 6
-# A leaf takes part in a new group when so many of its points fit nothing.
-_LEFT_POINTS = 2
+# ... and with the points around those; what these count.
+_AROUND, _HARDLY = 12, 1e-3
+# The normals of narrow faces, and of points at edges, may be off so many times more than others.
+_NARROW = 2.0
+# ... where positions are so exact that a surface needs no more than this share of the points of a
+# patch: they tell by themselves.
+_ALONE = 0.5
+# A leaf takes part in a new group when so many of its points fit nothing, or one in so many.
+_LEFT_POINTS, _LEFT_SHARE = 2, 3
 # Samples for fitting a surface anew.
 _REFIT = 300
 # ... away from other surfaces, if there are so many of these.
@@ -74,35 +79,42 @@ class _Search:
     """What the rounds of the search share."""
 
     def __init__(self, grid: Grid, leaves: Leaves, tolerance: Tolerance, rule: Rule) -> None:
-        self.grid, self.leaves, self.tolerance, self.rule = grid, leaves, tolerance, rule
+        self.grid, self.leaves, self.tolerance = grid, leaves, tolerance
         self.samples = sample_leaves(grid, leaves, _SAMPLES)
         self.surfaces = no_surfaces()
         self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
-        self.choice: Choice | None = None
+        self.labelling = Labelling(grid, leaves, rule)
+        # Pairs of surfaces that were found not to be one.
+        self.apart = np.zeros(0, np.int64)
         # Surfaces found in what others left have to be clearly better where others fit.
         self.early = 0
-        # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut out
-        # of a group, is no group of its own.
+        # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut
+        # out of a group, is no group of its own.
         self.free = np.zeros(len(leaves), bool)
         self.face = np.zeros(len(leaves), bool)
 
     @property
     def label(self) -> np.ndarray:
         """Return the label of every sorted point."""
-        assert self.choice is not None
-        return runtime.download(self.choice.label)
+        return runtime.download(self.labelling.choice.label)
 
     def choose(self, passes: int = 1) -> None:
         """Let the points choose among the surfaces that have points near them."""
         late = np.arange(len(self.surfaces)) >= self.early
         table = surface_table(self.surfaces.kind, self.surfaces.parameters, _HANDICAP * late)
-        self.choice, self.own = label_points(
-            self.grid, self.leaves, self.own, table, self.rule, passes=passes, closed=self.free
-        )
+        self.own = self.labelling.choose(self.own, table, passes=passes, closed=self.free)
 
-    def add(self, samples: Samples, sets: list[np.ndarray], *, apart: bool = True) -> bool:
+    def add(
+        self,
+        samples: Samples,
+        sets: list[np.ndarray],
+        *,
+        apart: bool = True,
+        turn: float | None = None,
+    ) -> bool:
         """Explain sets of samples; say whether that gave any new surface."""
-        new, label = explain(samples, self.leaves, sets, self.tolerance, apart=apart)
+        tolerance = self.tolerance if turn is None else self.tolerance._replace(turn=turn)
+        new, label = explain(samples, self.leaves, sets, tolerance, apart=apart)
         for members in sets:
             large = samples.weight[members].sum() >= _FREE * self.tolerance.points
             explained = np.any(label[members] >= 0)
@@ -161,17 +173,28 @@ class _Search:
         cell = np.nonzero(there)[0]
         self.own = own_lists(self.leaves, cell, name[self.own[there]])
 
-    def rest(self) -> tuple[Samples, list[np.ndarray]]:
-        """Return samples of the points that fit nothing, in connected sets."""
+    def rest(self, *, around: bool = False) -> tuple[Samples, list[np.ndarray]]:
+        """Return samples of the points that fit nothing, in connected sets.
+
+        Points ``around`` them come with them, but hardly count: a narrow face shares most of its
+        points with the faces beside it.
+        """
         label, leaves = self.label, self.leaves
         left = np.add.reduceat((label < 0).astype(np.int32), leaves.first)
-        there = (left >= _LEFT_POINTS) & ~self.free & ~self.face
+        there = (left > 0) & ~self.free & ~self.face
+        if not around:
+            there &= (left >= _LEFT_POINTS) | (_LEFT_SHARE * left >= leaves.count)
         both = there[leaves.a] & there[leaves.b]
         root = components(len(leaves), leaves.a[both], leaves.b[both])
         size = np.bincount(root[there], left[there], minlength=len(leaves))
         kept = there & (size[root] >= self.tolerance.points)
-        blocked = np.where(np.repeat(kept, leaves.count), label, 0).astype(np.int32)
-        samples = sample_leaves(self.grid, leaves, _REST, label=blocked)
+        blocked = np.where(np.repeat(kept, leaves.count), NONE if around else label, 0)
+        samples = sample_leaves(
+            self.grid, leaves, _AROUND if around else _REST, label=blocked.astype(np.int32)
+        )
+        if around:
+            weight = np.where(label[samples.index] < 0, samples.weight, _HARDLY)
+            samples = replace(samples, weight=weight)
         part = root[samples.leaf]
         order = np.argsort(part, kind="stable")
         cut = np.flatnonzero(np.diff(part[order])) + 1
@@ -180,23 +203,30 @@ class _Search:
     def merge(self) -> bool:
         """Merge surfaces that are one; say whether there were any."""
         label = self.label[self.samples.index]
-        pairs, _ = contacts(self.leaves, self.own)
+        pairs = smooth_contacts(self.leaves, self.own, self.samples, self.surfaces)
+        key = pairs[:, 0] * len(self.surfaces) + pairs[:, 1]
         name, self.surfaces = merge_surfaces(
-            self.samples, label, self.surfaces, pairs, self.tolerance.noise
+            self.samples,
+            label,
+            self.surfaces,
+            pairs[~np.isin(key, self.apart)],
+            self.tolerance.noise,
         )
-        if np.array_equal(name, np.arange(len(name))):
+        changed = name != np.arange(len(name))
+        if not changed.any():
             return False
+        changed[name[changed]] = True
+        self.apart = key[~changed[pairs].any(axis=1)]
         self.rename(name)
         self.choose()
         return True
 
     def give_up(self) -> bool:
         """Give up surfaces that their neighbours explain; say whether there were any."""
-        assert self.choice is not None
         gone = explained_by_others(
             self.label,
-            runtime.download(self.choice.second),
-            runtime.download(self.choice.off),
+            runtime.download(self.labelling.choice.second),
+            runtime.download(self.labelling.choice.off),
             len(self.surfaces),
             _EXPLAINED,
         )
@@ -215,6 +245,8 @@ def find_surfaces(
     cut: np.ndarray,
     tolerance: Tolerance,
     rule: Rule,
+    *,
+    narrow: bool,
 ) -> Surfaced:
     """Find the analytic surfaces of a part, and the surface of every point.
 
@@ -226,6 +258,7 @@ def find_surfaces(
             a group is no sum of surfaces: each of its faces may still be one.
         tolerance: What counts as lying on a surface.
         rule: What a point may differ from the surface that it takes.
+        narrow: Positions are so exact that they tell narrow faces, whose normals do not.
     """
     search = _Search(grid, leaves, tolerance, rule)
     samples = search.samples
@@ -244,6 +277,12 @@ def find_surfaces(
             break
     else:
         search.choose(passes=2)
+    rest, sets = search.rest(around=True) if narrow else (rest, [])
+    # Normals of narrow faces are those of the faces beside them.
+    if sets and search.add(rest, sets, turn=_NARROW * tolerance.turn):
+        search.choose(passes=2)
+        search.refit()
+        search.choose()
     for _ in range(_MERGES):
         merged = search.merge()
         if not search.give_up() and not merged:
@@ -270,16 +309,21 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         found: The regions of the flood fill. Those that no analytic surface explains are kept.
         params: Parameters, all filled in.
     """
-    noise, tilt = params.surfaces.noise, params.surfaces.tilt
+    chosen = params.surfaces
+    noise, tilt, turn, fewest = chosen.noise, chosen.tilt, chosen.turn, chosen.min_points
     least = params.regions.min_points
-    assert noise is not None and tilt is not None and least is not None
+    assert noise is not None and tilt is not None and turn is not None
+    assert fewest is not None and least is not None
     graph = leaf_graph(grid, leaves.astype(np.int32), found.touching)
-    turn = max(TURNS[0], TURNS[1] * tilt)
     rule = Rule(noise, tilt)
+    exact = fewest <= _ALONE * least
+    if exact:
+        rule = rule._replace(turn=max(rule.turn, _NARROW * turn))
     surfaced = find_surfaces(
-        grid, graph, found.group[leaves], found.cut[leaves], Tolerance(noise, turn, least), rule
-    )
-    label, surface = number_pieces(graph, surfaced, least)
+        grid, graph, found.group[leaves], found.cut[leaves],
+        Tolerance(noise, turn, fewest, exact), rule, narrow=exact,
+    )  # fmt: skip
+    label, surface = number_pieces(graph, surfaced, least, fewest)
     # Regions of which surfaces explain less than half stay; they are free forms.
     rest = (label < 0) & (found.label >= 0)
     size = np.bincount(found.label[found.label >= 0], minlength=found.count)
@@ -296,8 +340,10 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         )
         loose = rule._replace(reach=_LOOSE * rule.reach, turn=float(np.pi))
         own = label_lists(graph, np.where(label < len(surface), label, NONE))
-        choice, _ = label_points(grid, graph, own, table, loose)
-        label = np.where(label < 0, runtime.download(choice.label), label)
+        labelling = Labelling(grid, graph, loose)
+        full = ~np.logical_or.reduceat(label < 0, graph.first)
+        labelling.choose(own, table, closed=full)
+        label = np.where(label < 0, runtime.download(labelling.choice.label), label)
     held = np.full(grid.count, NONE, np.int32)
     held[leaves] = common_label(graph, label)
     return replace(
@@ -312,13 +358,16 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
     )
 
 
-def number_pieces(leaves: Leaves, found: Surfaced, least: float) -> tuple[np.ndarray, np.ndarray]:
+def number_pieces(
+    leaves: Leaves, found: Surfaced, least: float, fewest: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Number the connected pieces of the surfaces by size.
 
     Args:
         leaves: The leaves.
         found: The surfaces and their points.
-        least: A piece with fewer points is no patch.
+        least: A piece with fewer points is no patch,
+        fewest: unless it is the largest of its surface and has so many.
 
     Returns:
         Patch of every sorted point, -1 = none, shape (n,), i32; and the surface of every patch.
@@ -327,16 +376,19 @@ def number_pieces(leaves: Leaves, found: Surfaced, least: float) -> tuple[np.nda
     leaf = np.repeat(np.arange(len(leaves)), leaves.count)
     there = found.label >= 0
     cell, name = leaf[there], found.label[there]
-    rank = (found.own[cell] == name[:, None]).argmax(axis=1)
-    mine = piece[cell, rank]
+    mine = piece[cell, 0]
+    others = np.flatnonzero(found.own[cell, 0] != name)
+    rank = (found.own[cell[others]] == name[others, None]).argmax(axis=1)
+    mine[others] = piece[cell[others], rank]
     size = np.bincount(mine)
-    names = np.flatnonzero(size >= max(least, 1))
+    most = np.zeros(len(found.surfaces), np.int64)
+    np.maximum.at(most, name, size[mine])
+    main = np.zeros(len(size), bool)
+    main[mine] = size[mine] == most[name]
+    names = np.flatnonzero(size >= np.where(main, max(fewest, 1), max(least, 1)))
     names = names[np.argsort(-size[names], kind="stable")]
     number = np.full(len(size), NONE, np.int32)
     number[names] = np.arange(len(names), dtype=np.int32)
     label = np.full(len(found.label), NONE, np.int32)
     label[there] = number[mine]
-    surface = np.zeros(len(names), np.int32)
-    kept = label[there] >= 0
-    surface[label[there][kept]] = name[kept]
-    return label, surface
+    return label, found.own[found.own >= 0][names]  # pieces are named by an entry of the lists

@@ -90,32 +90,30 @@ def _gather(
 def _choose(
     rule: ti.types.vector(4, ti.f64),
     # In:
+    todo_in: I32Array,
     point_in: F64Rows,
     normal_in: F64Rows,
     leaf_in: I32Rows,
     near_in: I32Rows,
     surface_in: F64Rows,
     # Out:
-    own_out: I32Rows,
-    label_out: I32Array,
-    second_out: I32Array,
-    off_out: F32Rows,
+    own_inout: I32Rows,
+    label_inout: I32Array,
+    second_inout: I32Array,
+    off_inout: F32Rows,
 ):
-    """Find the two best surfaces of every point, and the surfaces that each leaf ends up with."""
-    for c in range(leaf_in.shape[0]):
+    """Find the two best surfaces of every point of some leaves, and those these end up with."""
+    for e in todo_in:
+        c = todo_in[e]
         for k in range(MOST):
-            own_out[c, k] = -1
+            own_inout[c, k] = -1
         for i in range(leaf_in[c, 0], leaf_in[c, 0] + leaf_in[c, 1]):
             p = row(point_in, i)
             m = row(normal_in, i)
-            best = 1e30
-            next_best = 1e30
-            label_out[i] = -1
-            second_out[i] = -1
-            for j in ti.static(range(2)):
-                off_out[i, j] = ti.f32(1e30)
-            best_off = 1e30
-            best_turn = 1e30
+            best = vec3(1e30, 1e30, 1e30)  # cost, distance and angle
+            after = best
+            label = -1
+            second = -1
             k = 0
             while k < MOST and near_in[c, k] >= 0:
                 s = near_in[c, k]
@@ -123,30 +121,32 @@ def _choose(
                 origin = row(surface_in, s)
                 axis = vec3(surface_in[s, 3], surface_in[s, 4], surface_in[s, 5])
                 d, n = surface_at(kind, p, origin, axis, surface_in[s, 6], surface_in[s, 7])
-                angle = ti.acos(ti.min(1.0, ti.abs(n.dot(m))))
-                if m.norm_sqr() == 0.0:
-                    angle = 0.0
                 off = ti.abs(d) / rule[0]
-                if angle <= rule[3]:
-                    tilt = ti.min(angle / rule[1], 6.0)
-                    cost = off * off + tilt * tilt + surface_in[s, 9]
-                    if off <= rule[2] and cost < best:
-                        next_best = best
-                        second_out[i] = label_out[i]
-                        off_out[i, 0] = ti.cast(best_off, ti.f32)
-                        off_out[i, 1] = ti.cast(best_turn, ti.f32)
-                        best = cost
-                        label_out[i] = s
-                        best_off = off
-                        best_turn = angle / rule[1]
-                    elif cost < next_best:
-                        next_best = cost
-                        second_out[i] = s
-                        off_out[i, 0] = ti.cast(off, ti.f32)
-                        off_out[i, 1] = ti.cast(angle / rule[1], ti.f32)
+                least = off * off + surface_in[s, 9]
+                if least < after[0] or (off <= rule[2] and least < best[0]):
+                    facing = ti.select(m.norm_sqr() > 0.0, ti.abs(n.dot(m)), 1.0)
+                    angle = ti.acos(ti.min(1.0, facing))
+                    turn = angle / rule[1]
+                    # Beyond six deviations hardly more: of two surfaces through a point of an edge
+                    # the one that it faces a little.
+                    tilt = ti.min(turn, 6.0 + 0.1 * ti.max(turn - 6.0, 0.0))
+                    this = vec3(least + tilt * tilt, off, turn)
+                    if angle <= rule[3]:
+                        if off <= rule[2] and this[0] < best[0]:
+                            after = best
+                            second = label
+                            best = this
+                            label = s
+                        elif this[0] < after[0]:
+                            after = this
+                            second = s
                 k += 1
-            if label_out[i] >= 0:
-                _insert(own_out, c, label_out[i])
+            label_inout[i] = label
+            second_inout[i] = second
+            off_inout[i, 0] = ti.cast(after[1], ti.f32)
+            off_inout[i, 1] = ti.cast(after[2], ti.f32)
+            if label >= 0:
+                _insert(own_inout, c, label)
 
 
 def own_lists(leaves: Leaves, leaf: np.ndarray, label: np.ndarray) -> np.ndarray:
@@ -240,47 +240,70 @@ def surface_table(
     )
 
 
-def label_points(
-    grid: Grid,
-    leaves: Leaves,
-    own: np.ndarray,
-    surfaces: np.ndarray,
-    rule: Rule,
-    *,
-    passes: int = 1,
-    closed: np.ndarray | None = None,
-) -> tuple[Choice, np.ndarray]:
-    """Let every point choose its surface.
+class Labelling:
+    """The choices of all points, kept from one time to the next: most leaves see nothing new."""
 
-    Args:
-        grid: The sparse grid.
-        leaves: Its leaves.
-        own: Surfaces with points in every leaf, shape (C, MOST), i32 (`own_lists`).
-        surfaces: The surfaces (`surface_table`), shape (M, 10).
-        rule: What a point may differ from its surface.
-        passes: How many leaves beyond those in ``own`` a surface may reach.
-        closed: Leaves whose points choose nothing, shape (C,), bool; None = no leaf.
+    def __init__(self, grid: Grid, leaves: Leaves, rule: Rule) -> None:
+        runtime.ensure_started()
+        n = grid.order.shape[0]
+        self.grid, self.rule, self.count = grid, rule, len(leaves)
+        self.choice = Choice(
+            runtime.empty(n, np.int32),
+            runtime.empty(n, np.int32),
+            runtime.empty((n, 2), np.float32),
+        )
+        self._start, self._neighbor = runtime.upload(leaves.start), runtime.upload(leaves.neighbor)
+        self._leaf = runtime.upload(np.stack([leaves.first, leaves.count], axis=1))
+        self._surfaces = np.zeros((0, 10))
+        self._near: np.ndarray | None = None
+        self._own = np.full((len(leaves), MOST), NONE, np.int32)
 
-    Returns:
-        The choice, and the surfaces that each leaf ended up with, as ``own``.
-    """
-    runtime.ensure_started()
-    n = grid.order.shape[0]
-    label, second = runtime.empty(n, np.int32), runtime.empty(n, np.int32)
-    off = runtime.empty((n, 2), np.float32)
-    held = runtime.upload(own)
-    near = runtime.empty(own.shape, np.int32)
-    shut = runtime.upload(
-        np.zeros(len(leaves), np.int32) if closed is None else closed.astype(np.int32)
-    )
-    start, neighbor = runtime.upload(leaves.start), runtime.upload(leaves.neighbor)
-    table = runtime.upload(np.stack([leaves.first, leaves.count], axis=1))
-    device_surfaces = runtime.upload(surfaces)
-    for _ in range(passes):
-        _gather(held, shut, start, neighbor, near)
-        held = runtime.empty(own.shape, np.int32)
-        _choose(
-            tuple(rule), grid.point, grid.normal, table, near, device_surfaces,
-            held, label, second, off,
-        )  # fmt: skip
-    return Choice(label, second, off), runtime.download(held)
+    def choose(
+        self,
+        own: np.ndarray,
+        surfaces: np.ndarray,
+        *,
+        passes: int = 1,
+        closed: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Let every point choose its surface.
+
+        Args:
+            own: Surfaces with points in every leaf, shape (C, MOST), i32 (`own_lists`).
+            surfaces: The surfaces (`surface_table`), shape (M, 10).
+            passes: How many leaves beyond those in ``own`` a surface may reach.
+            closed: Leaves whose points choose nothing, shape (C,), bool; None = no leaf.
+
+        Returns:
+            The surfaces that each leaf ended up with, as ``own``.
+        """
+        shut = np.zeros(self.count, np.int32) if closed is None else closed.astype(np.int32)
+        device_shut, device_surfaces = runtime.upload(shut), runtime.upload(surfaces)
+        for _ in range(passes):
+            near = runtime.empty(own.shape, np.int32)
+            _gather(runtime.upload(own), device_shut, self._start, self._neighbor, near)
+            stale = self._stale(runtime.download(near), surfaces)
+            own = self._own.copy()
+            if len(stale):
+                held = runtime.upload(own)
+                _choose(
+                    tuple(self.rule), runtime.upload(stale), self.grid.point, self.grid.normal,
+                    self._leaf, near, device_surfaces, held, *self.choice,
+                )  # fmt: skip
+                own = runtime.download(held)
+            self._own = own
+        return own
+
+    def _stale(self, near: np.ndarray, surfaces: np.ndarray) -> np.ndarray:
+        """Return the leaves that see other surfaces than the last time, ascending, i32."""
+        before, self._near = self._near, near
+        both = min(len(surfaces), len(self._surfaces))
+        changed = np.ones(len(surfaces) + 1, bool)
+        same = (surfaces[:both] == self._surfaces[:both]) | np.isnan(surfaces[:both])
+        changed[:both] = ~same.all(axis=1)
+        changed[-1] = False  # of the -1 that ends a list
+        self._surfaces = surfaces
+        if before is None:
+            return np.arange(len(near), dtype=np.int32)
+        stale = (near != before).any(axis=1) | changed[near].any(axis=1)
+        return np.flatnonzero(stale).astype(np.int32)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from octoseg_ti.device import runtime
-from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
+from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, I64Rows, ti
 from octoseg_ti.stages.adjacency import Adjacency
 from octoseg_ti.stages.grid import Grid
 
@@ -60,6 +60,8 @@ class Samples:
     """Unit normal, shape (A, 3), f64."""
     weight: np.ndarray
     """How many points a sample stands for, shape (A,), f64."""
+    signed: bool = True
+    """Normals have a side; without one only their axes count."""
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -88,26 +90,32 @@ def _pick(
     taken_in: I32Array,
     leaf_in: I32Rows,
     # Out:
+    hash_out: I64Rows,
     index_out: I32Rows,
     count_out: I32Array,
 ):
     """Write the points of every leaf with the smallest hashes, of those not taken; count these."""
     for c in count_out:
         free = 0
-        last = ti.i64(-0x7FFFFFFFFFFFFFFF)
-        for s in range(most):
-            best = ti.i64(0x7FFFFFFFFFFFFFFF)
-            found = -1
-            for i in range(leaf_in[c, 0], leaf_in[c, 0] + leaf_in[c, 1]):
-                if taken_in[i] < 0:
-                    if s == 0:
-                        free += 1
-                    h = _hash(point_in, i, fine)
-                    if h > last and h < best:
-                        best = h
-                        found = i
-            index_out[c, s] = found
-            last = best
+        held = 0
+        for k in range(most):
+            index_out[c, k] = -1
+        for i in range(leaf_in[c, 0], leaf_in[c, 0] + leaf_in[c, 1]):
+            if taken_in[i] < 0:
+                free += 1
+                h = _hash(point_in, i, fine)
+                at = held  # of equal hashes the first point counts
+                while at > 0 and hash_out[c, at - 1] >= h:
+                    at -= 1
+                if at < most and (at == held or hash_out[c, at] != h):
+                    held = ti.min(held + 1, most)
+                    k = held - 1
+                    while k > at:
+                        hash_out[c, k] = hash_out[c, k - 1]
+                        index_out[c, k] = index_out[c, k - 1]
+                        k -= 1
+                    hash_out[c, at] = h
+                    index_out[c, at] = i
         count_out[c] = free
 
 
@@ -160,7 +168,10 @@ def sample_leaves(
     free = runtime.empty(len(leaves), np.int32)
     table = np.stack([leaves.first, leaves.count], axis=1)
     fine = _FINE * 2.0**grid.depth / grid.size
-    _pick(most, fine, grid.point, runtime.upload(taken), runtime.upload(table), index, free)
+    scratch = runtime.empty((len(leaves), most), np.int64)
+    _pick(
+        most, fine, grid.point, runtime.upload(taken), runtime.upload(table), scratch, index, free
+    )  # fmt: skip
     picked, there = runtime.download(index), runtime.download(free)
     found = picked >= 0
     each = found.sum(axis=1)
@@ -172,4 +183,5 @@ def sample_leaves(
         point=runtime.download(grid.point)[picked],
         normal=runtime.download(grid.normal)[picked],
         weight=np.repeat(there / np.maximum(each, 1), each),
+        signed=grid.signed,
     )

@@ -22,6 +22,8 @@ _FIT = 1.2
 _CAP = 4.0
 # A surface with fewer samples says nothing about another.
 _FEW = 10
+# Surfaces whose normals differ by more than this where they meet [rad] meet at an edge.
+_EDGE = 0.7
 _UNIT = 1024.0
 # What deviates by no more than this many noises and tilts, and is no larger than this share of the
 # surface beside it, is an error of its form.
@@ -39,6 +41,35 @@ def contacts(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         The pairs, smaller number first, ascending, shape (P, 2); and how many leaves and pairs of
         leaves each was found in, shape (P,).
     """
+    one, other, _ = _touches(leaves, own)
+    key, count = np.unique(_keys(one, other, own), return_counts=True)
+    return _pairs_of(key, own), count
+
+
+def smooth_contacts(
+    leaves: Leaves, own: np.ndarray, samples: Samples, surfaces: Surfaces
+) -> np.ndarray:
+    """Return the pairs of surfaces that do not meet at an edge: only these can be one.
+
+    Args:
+        leaves: The leaves.
+        own: As of `contacts`.
+        samples: Samples of all leaves, in their order.
+        surfaces: The surfaces.
+
+    Returns:
+        Of the pairs of `contacts` those whose normals agree somewhere where they touch.
+    """
+    one, other, leaf = _touches(leaves, own)
+    point = samples.point[np.searchsorted(samples.leaf, leaf)]
+    _, n = evaluate_surfaces(point, one, surfaces.kind, surfaces.parameters)
+    _, m = evaluate_surfaces(point, other, surfaces.kind, surfaces.parameters)
+    smooth = np.abs(np.einsum("ij,ij->i", n, m)) >= np.cos(_EDGE)
+    return _pairs_of(np.unique(_keys(one, other, own)[smooth]), own)
+
+
+def _touches(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return two surfaces, and a leaf, for every place where these touch."""
     held = (own >= 0).sum(axis=1)
     cells = np.arange(len(own), dtype=np.int32)
     a, b = np.concatenate([leaves.a, cells]), np.concatenate([leaves.b, cells])
@@ -50,10 +81,17 @@ def contacts(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rank = np.arange(len(at)) - np.repeat(np.cumsum(each) - each, each)
     one, other = own[a[at], rank // held[b[at]]], own[b[at], rank % held[b[at]]]
     differ = one != other
-    low, high = np.minimum(one, other)[differ], np.maximum(one, other)[differ]
+    return one[differ], other[differ], a[at[differ]]
+
+
+def _keys(one: np.ndarray, other: np.ndarray, own: np.ndarray) -> np.ndarray:
     width = int(own.max(initial=0)) + 1
-    key, count = np.unique(low.astype(np.int64) * width + high, return_counts=True)
-    return np.stack([key // width, key % width], axis=1), count
+    return np.minimum(one, other).astype(np.int64) * width + np.maximum(one, other)
+
+
+def _pairs_of(key: np.ndarray, own: np.ndarray) -> np.ndarray:
+    width = int(own.max(initial=0)) + 1
+    return np.stack([key // width, key % width], axis=1)
 
 
 def members_of(label: np.ndarray, count: int) -> list[np.ndarray]:
@@ -163,16 +201,15 @@ def explained_by_others(
         Which surfaces to give up, shape (M,), bool: the smallest first, and none that one given up
         leans on.
     """
-    here = label >= 0
+    here = np.flatnonzero((label >= 0) & (second >= 0))
     mine, other, near = label[here], second[here], off[here]
-    size = np.bincount(mine, minlength=count)
-    far = _mean_square(mine, np.where(other >= 0, near[:, 0], np.inf), _CAP, count)
-    deviation = _mean_square(mine, np.where(other >= 0, near[:, 0], np.inf), 2.0 * _FORM, count)
-    turn = _mean_square(mine, np.where(other >= 0, near[:, 1], np.inf), 2.0 * _SMOOTH, count)
+    size = np.bincount(label[label >= 0], minlength=count)
+    alone = size - np.bincount(mine, minlength=count)
+    far, deviation = _mean_squares(mine, near[:, 0], (_CAP, 2.0 * _FORM), size, alone)
+    (turn,) = _mean_squares(mine, near[:, 1], (2.0 * _SMOOTH,), size, alone)
     given_up = np.zeros(count, bool)
     leaned_on = np.zeros(count, bool)
-    key = mine.astype(np.int64) * count + np.where(other >= 0, other, mine)
-    pair, points = np.unique(key, return_counts=True)
+    pair, points = _pairs(mine, other, alone, count)
     for m in np.argsort(size, kind="stable"):
         if size[m] == 0 or leaned_on[m]:
             continue
@@ -193,11 +230,42 @@ def explained_by_others(
     return given_up
 
 
-def _mean_square(owner: np.ndarray, value: np.ndarray, cap: float, count: int) -> np.ndarray:
-    """Return the mean square of the values of every owner, no value above the cap."""
-    square = np.minimum(value, cap) ** 2
-    square = np.rint(_UNIT * square) / _UNIT  # whole units add up alike in any order
-    return np.bincount(owner, square, count) / np.maximum(np.bincount(owner, minlength=count), 1)
+def _pairs(
+    mine: np.ndarray, other: np.ndarray, alone: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the keys of surfaces and those next to them, ascending, and the points of each.
+
+    Points with nothing near, ``alone``, count for their own surface.
+    """
+    key = np.concatenate([mine.astype(np.int64) * count + other, np.arange(count) * (count + 1)])
+    points = np.concatenate([np.ones(len(mine)), alone])
+    if count * count <= 4 * len(key):
+        total = np.bincount(key, points, count * count).astype(np.int64)
+        pair = np.flatnonzero(total)
+        return pair, total[pair]
+    pair, place = np.unique(key, return_inverse=True)
+    total = np.bincount(place, points).astype(np.int64)
+    return pair[total > 0], total[total > 0]
+
+
+def _mean_squares(
+    owner: np.ndarray,
+    value: np.ndarray,
+    caps: tuple[float, ...],
+    size: np.ndarray,
+    alone: np.ndarray,
+) -> list[np.ndarray]:
+    """Return the mean square of the values of every owner, no value above the cap, for every cap.
+
+    Points that are ``alone`` count with the cap.
+    """
+    square = np.rint(_UNIT * value.astype(np.float64) ** 2)  # whole units add up alike in any order
+    means = []
+    for cap in caps:
+        limit = np.rint(_UNIT * cap**2)
+        total = np.bincount(owner, np.minimum(square, limit), len(size)) + alone * limit
+        means.append(total / _UNIT / np.maximum(size, 1))
+    return means
 
 
 def pieces(leaves: Leaves, own: np.ndarray, count: int) -> np.ndarray:
@@ -209,7 +277,8 @@ def pieces(leaves: Leaves, own: np.ndarray, count: int) -> np.ndarray:
         count: Number of surfaces M.
 
     Returns:
-        Piece of every entry of ``own``, named by its first entry, -1 where there is none; shape
+        Piece of every entry of ``own``, named by the number of its first entry among those that
+        are, row by row; -1 where there is none; shape
         (C, most), i32.
     """
     most = own.shape[1]

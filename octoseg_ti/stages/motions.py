@@ -215,4 +215,5 @@ def _anchor_radii(state: np.ndarray) -> np.ndarray:
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+    size = np.linalg.norm(v, axis=-1, keepdims=True)
+    return np.divide(v, size, out=np.full_like(v, np.nan), where=size > 0)

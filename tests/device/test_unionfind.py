@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from reference.graph import components
 
-from octoseg_ti.device import runtime
+from octoseg_ti.device import runtime, unionfind
 from octoseg_ti.device.runtime import I32Array, I32Rows, ti
 from octoseg_ti.device.unionfind import find, unite
 
@@ -54,6 +54,8 @@ def walked(n: int, edges: np.ndarray) -> list[int]:
 def test_random_graphs(seed: int, n: int, share: float) -> None:
     edges = np.random.default_rng(seed).integers(0, n, (int(share * n), 2))
     assert roots(n, edges) == walked(n, edges), f"seed {seed}"
+    a, b = edges.astype(np.int32).T
+    assert unionfind.components(n, a, b).tolist() == walked(n, edges), f"seed {seed}"
 
 
 @pytest.mark.parametrize("order", ["up", "down", "random"])
@@ -73,3 +75,9 @@ def test_star_and_order() -> None:
     assert roots(n, edges) == [0] + [1] * (n - 1)
     shuffled = edges[np.random.default_rng(1).permutation(len(edges))][:, ::-1].copy()
     assert roots(n, shuffled) == [0] + [1] * (n - 1)
+
+
+def test_without_edges_every_member_is_alone() -> None:
+    none = np.zeros(0, np.int32)
+    assert unionfind.components(4, none, none).tolist() == [0, 1, 2, 3]
+    assert unionfind.components(0, none, none).tolist() == []

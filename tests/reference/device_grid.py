@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from octoseg_ti.device import runtime
-from octoseg_ti.stages.grid import Grid
+from octoseg_ti.stages.adjacency import find_touching
+from octoseg_ti.stages.grid import Grid, build_grid
+from octoseg_ti.stages.leaves import Leaves, Samples, leaf_graph
 from octoseg_ti.stages.moments import HI, LEVEL, LO, NORMAL, POINT, X, Z
+from reference.clouds import random_surface
 from reference.graph import Leaf
 
 
@@ -53,3 +56,29 @@ def as_array(values: dict[int, int], count: int) -> np.ndarray:
     for node, value in values.items():
         array[node] = value
     return array
+
+
+def touching_leaves(grid: Grid) -> Leaves:
+    """Return the graph of the leaves of a grid."""
+    node = leaf_nodes(grid)
+    node = node[np.argsort(grid.first[node], kind="stable")]
+    return leaf_graph(grid, node.astype(np.int32), find_touching(grid))
+
+
+def surface_leaves(seed: int, n: int = 1500) -> tuple[Grid, Leaves]:
+    """Return the grid of a random surface, and its leaves."""
+    points, normals = random_surface(seed, n)
+    grid = build_grid(points, normals, tolerance=0.05, min_cell=0.7, min_points=3)
+    return grid, touching_leaves(grid)
+
+
+def samples_of(points: np.ndarray, normals: np.ndarray) -> Samples:
+    """Return points as samples, each of a leaf of its own."""
+    n = len(points)
+    return Samples(
+        index=np.arange(n, dtype=np.int32),
+        leaf=np.arange(n, dtype=np.int32),
+        point=points,
+        normal=normals,
+        weight=np.ones(n),
+    )

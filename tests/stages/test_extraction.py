@@ -1,0 +1,76 @@
+"""Sets of samples are explained by one surface, or taken apart into several."""
+
+import numpy as np
+import pytest
+from reference.device_grid import touching_leaves
+
+from octoseg_ti.device import runtime
+from octoseg_ti.stages.extraction import Tolerance, explain
+from octoseg_ti.stages.grid import Grid, build_grid
+from octoseg_ti.stages.leaves import Leaves, Samples, sample_leaves
+from octoseg_ti.types import SurfaceKind
+
+NOISE = 0.01
+TOLERANCE = Tolerance(noise=0.015, turn=0.2, points=40)
+
+
+def profile(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return height and slope of two flat faces with a round of radius 5 between, all tangent."""
+    radius, angle = 5.0, 1.2
+    turn = np.clip(x / radius, 0.0, angle)
+    beyond = np.maximum(x / radius - angle, 0.0) * radius
+    height = radius * (1.0 - np.cos(turn)) + beyond * np.sin(angle)
+    place = np.where(x < 0.0, x, radius * np.sin(turn) + beyond * np.cos(angle))
+    return np.stack([place, height], axis=1), turn
+
+
+def bent_sheet(seed: int, n: int = 12000) -> tuple[Grid, Leaves, Samples, np.ndarray]:
+    """Return a bent sheet, its samples, and the face of each: 0, 1 (round), 2."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-8.0, 14.0, n), rng.uniform(0.0, 10.0, n)
+    place, turn = profile(x)
+    points = np.column_stack([place[:, 0], y, place[:, 1]])
+    normals = np.column_stack([-np.sin(turn), np.zeros(n), np.cos(turn)])
+    points += NOISE * rng.normal(size=points.shape)
+    grid = build_grid(points, normals, tolerance=0.06, divisions=16, min_cell=0.4, min_points=4)
+    leaves = touching_leaves(grid)
+    samples = sample_leaves(grid, leaves, 4)
+    face = np.where(x < 0.0, 0, np.where(x < 6.0, 1, 2))
+    return grid, leaves, samples, face[runtime.download(grid.order)[samples.index]]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_bent_sheet_comes_apart_into_faces_and_a_round(seed: int) -> None:
+    _, leaves, samples, face = bent_sheet(seed)
+    surfaces, label = explain(samples, leaves, [np.arange(len(samples))], TOLERANCE)
+    main = [np.bincount(label[(face == f) & (label >= 0)]).argmax() for f in range(3)]
+    assert len(set(main)) == 3
+    kinds = [SurfaceKind.PLANE, SurfaceKind.CYLINDER, SurfaceKind.PLANE]
+    assert [SurfaceKind(int(surfaces.kind[m])) for m in main] == kinds
+    np.testing.assert_allclose(surfaces.parameters[main[1], 6], 5.0, atol=0.25)
+    # The faces reach as far into the round as it is flat within the tolerance.
+    for f, share in enumerate((0.95, 0.6, 0.95)):
+        assert np.mean(label[face == f] == main[f]) > share
+
+
+def test_one_face_is_one_surface() -> None:
+    _, leaves, samples, face = bent_sheet(0)
+    flat = np.flatnonzero(face == 0)
+    surfaces, label = explain(samples, leaves, [flat], TOLERANCE)
+    assert surfaces.kind.tolist() == [SurfaceKind.PLANE]
+    assert np.mean(label[flat] == 0) > 0.95
+    assert (label[face > 0] == -1).all()
+
+
+def test_sets_are_left_whole_when_asked() -> None:
+    _, leaves, samples, _ = bent_sheet(0)
+    surfaces, label = explain(samples, leaves, [np.arange(len(samples))], TOLERANCE, apart=False)
+    assert len(surfaces) == 0
+    assert (label == -1).all()
+
+
+def test_nothing_is_explained_by_nothing() -> None:
+    _, leaves, samples, _ = bent_sheet(0)
+    surfaces, label = explain(samples, leaves, [], TOLERANCE)
+    assert len(surfaces) == 0
+    assert (label == -1).all()

@@ -1,0 +1,123 @@
+"""Surfaces that meet, that are one, that others explain; and their connected pieces."""
+
+import numpy as np
+import pytest
+from reference import meeting
+from reference.device_grid import samples_of, surface_leaves
+from reference.surfaces import CYLINDER, PLANE, patch_of
+
+from octoseg_ti.stages.labelling import own_lists
+from octoseg_ti.stages.leaves import Leaves, sample_leaves
+from octoseg_ti.stages.merging import (
+    contacts,
+    explained_by_others,
+    members_of,
+    merge_surfaces,
+    pieces,
+    smooth_contacts,
+)
+from octoseg_ti.stages.sets import Surfaces
+
+NOISE = 0.02
+
+
+def random_own(leaves: Leaves, seed: int, count: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    leaf = rng.integers(0, len(leaves), 2 * len(leaves))
+    return own_lists(leaves, leaf, rng.integers(-1, count, len(leaf)))
+
+
+def as_lists(own: np.ndarray) -> list[list[int]]:
+    return [row[row >= 0].tolist() for row in own]
+
+
+def pairs_of(leaves: Leaves) -> list[tuple[int, int]]:
+    return list(zip(leaves.a.tolist(), leaves.b.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("count", [1, 3, 40])
+def test_contacts_equal_the_reference(seed: int, count: int) -> None:
+    _, leaves = surface_leaves(seed, 900)
+    own = random_own(leaves, seed, count)
+    pairs, places = contacts(leaves, own)
+    expected = meeting.contacts(as_lists(own), pairs_of(leaves))
+    found = {(int(a), int(b)): int(n) for (a, b), n in zip(pairs, places, strict=True)}
+    assert found == expected
+    assert list(found) == sorted(found)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("count", [1, 3, 40])
+def test_pieces_equal_the_reference(seed: int, count: int) -> None:
+    _, leaves = surface_leaves(seed, 900)
+    own = random_own(leaves, seed, count)
+    assert as_lists(pieces(leaves, own, count)) == meeting.pieces(as_lists(own), pairs_of(leaves))
+
+
+def test_surfaces_that_meet_at_an_edge_are_no_smooth_contact() -> None:
+    grid, leaves = surface_leaves(0, 900)
+    own = own_lists(leaves, np.repeat(np.arange(len(leaves)), 3), np.tile([0, 1, 2], len(leaves)))
+    parameters = np.full((3, 8), np.nan)
+    parameters[:, :3] = 0.0
+    for s, angle in enumerate((0.0, 0.3, 1.2)):
+        parameters[s, 3:6] = 0.0, np.sin(angle), np.cos(angle)
+    surfaces = Surfaces(kind=np.zeros(3, np.int32), parameters=parameters)
+    smooth = smooth_contacts(leaves, own, sample_leaves(grid, leaves, 2), surfaces)
+    np.testing.assert_array_equal(smooth, [[0, 1]])
+    assert len(contacts(leaves, own)[0]) == 3
+
+
+def test_members_of_labels() -> None:
+    label = np.array([2, -1, 0, 2, 0, 2], np.int32)
+    assert [m.tolist() for m in members_of(label, 4)] == [[2, 4], [], [0, 3, 5], []]
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("count", [4, 200])
+def test_surfaces_explained_by_others_equal_the_reference(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = 3000
+    label = rng.integers(-1, count, n).astype(np.int32)
+    second = np.where(rng.random(n) < 0.02, -1, (label + rng.integers(1, 4, n)) % count)
+    second[label < 0] = -1
+    calm = rng.random(count) < 0.5
+    off = np.abs(rng.normal(0.0, np.where(calm[label], 0.7, 3.0))).astype(np.float32)
+    off = np.stack([off, np.full(n, 9.0, np.float32)], axis=1)
+    off[second < 0] = np.float32(1e30)
+    gone = explained_by_others(label, second.astype(np.int32), off, count, 2.0)
+    assert set(np.flatnonzero(gone).tolist()) == set(
+        meeting.explained_by_others(label, second, off, count, 2.0)
+    )
+    assert gone.any() == calm.any()
+    assert not gone.all()
+
+
+def test_a_small_smooth_error_of_form_is_given_up() -> None:
+    label = np.repeat([0, 1], [1000, 60]).astype(np.int32)
+    second = 1 - label
+    off = np.full((1060, 2), 30.0, np.float32)
+    off[label == 1] = 2.5, 1.0  # a little off, and with the same normals
+    np.testing.assert_array_equal(explained_by_others(label, second, off, 2, 2.0), [False, True])
+    off[label == 1, 1] = 8.0
+    assert not explained_by_others(label, second, off, 2, 2.0).any()
+
+
+def test_halves_of_a_cylinder_are_merged_and_a_plane_is_not() -> None:
+    rng = np.random.default_rng(0)
+    points, normals, parameters = patch_of(CYLINDER, rng, 400)
+    flat, up, level = patch_of(PLANE, rng, 200)
+    points = np.concatenate([points, flat - [0, 0, 2.0]]) + rng.normal(0.0, NOISE, (600, 3))
+    samples = samples_of(points, np.concatenate([normals, up]))
+    label = np.concatenate([np.where(points[:400, 2] > 4.0, 1, 0), np.full(200, 2)])
+    surfaces = Surfaces(
+        kind=np.array([CYLINDER, CYLINDER, PLANE], np.int32),
+        parameters=np.stack([parameters, parameters, level - [0, 0, 2.0, 0, 0, 0, 0, 0]]),
+    )
+    pairs = np.array([[0, 1], [0, 2]])
+    name, merged = merge_surfaces(samples, label.astype(np.int32), surfaces, pairs, NOISE)
+    assert name[0] == name[1]
+    assert name[2] == 2
+    kept = int(name[0])
+    assert merged.kind[kept] == CYLINDER
+    np.testing.assert_allclose(merged.parameters[kept, 6], 6.0, atol=0.02)
