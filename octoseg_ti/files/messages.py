@@ -56,7 +56,6 @@ PARAMS_FIELDS = (
     ("edges_smallest_levels", "double"),
     ("edges_fillet_levels", "double"),
     ("edges_radius", "double"),
-    ("edges_fillet_radius", "double"),
     ("regions_homogeneity", "double"),
     ("regions_min_points", "double"),
     ("regions_assign_edges", "bool"),
@@ -68,6 +67,7 @@ PARAMS_FIELDS = (
     ("surfaces_enabled", "bool"),
     ("surfaces_noise", "double"),
     ("surfaces_tilt", "double"),
+    ("edges_fillet_radius", "double"),
 )
 """octoseg.Params: "section_option" of `Params`, mm and rad; NaN or "" = derived from the data."""
 
