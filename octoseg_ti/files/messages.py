@@ -65,7 +65,6 @@ PARAMS_FIELDS = (
     ("registration_reach", "double"),
     ("registration_overlap", "double"),
     ("normals_smooth", "double"),
-    ("edges_fillet_radius", "double"),
     ("surfaces_enabled", "bool"),
     ("surfaces_noise", "double"),
     ("surfaces_tilt", "double"),
