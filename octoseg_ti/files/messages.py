@@ -68,6 +68,8 @@ PARAMS_FIELDS = (
     ("surfaces_enabled", "bool"),
     ("surfaces_noise", "double"),
     ("surfaces_tilt", "double"),
+    ("surfaces_turn", "double"),
+    ("surfaces_min_points", "double"),
 )
 """octoseg.Params: "section_option" of `Params`, mm and rad; NaN or "" = derived from the data."""
 
