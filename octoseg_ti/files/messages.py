@@ -67,6 +67,8 @@ PARAMS_FIELDS = (
     ("surfaces_enabled", "bool"),
     ("surfaces_noise", "double"),
     ("surfaces_tilt", "double"),
+    ("surfaces_turn", "double"),
+    ("surfaces_min_points", "double"),
     ("edges_fillet_radius", "double"),
 )
 """octoseg.Params: "section_option" of `Params`, mm and rad; NaN or "" = derived from the data."""
