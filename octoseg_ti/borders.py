@@ -50,10 +50,12 @@ _GAIN, _EACH = 40.0, 0.25
 _ARC = 1.5  # a fillet is at least this wide [spacings]
 _SLACK = 1.05  # its radius may be above the limit by so much: that it is not known exactly
 _FEWEST = 8
+_SHARED = 2.0  # neighbours share some of their noise, and the sides are not known exactly
 # Its points are no farther from the ball than from the surfaces of their patches, times this, plus
 # so many noises.
 _WORSE, _EVEN = 1.2, 0.3
 _FRESH = 0.5  # ... and this share of its points is on no better one
+_WEAK = 2.0  # a point so many noises from the surface of its patch lies on that
 _STRIP_SHARE = 0.5  # a patch is the strip of a fillet when so much of it is claimed
 _REFIT = 300
 _EDGE = 2.0  # edge points are this near an edge [spacings]
@@ -161,6 +163,13 @@ class Search:
         self.own = label_lists(leaves, label)
         self.near = near_lists(leaves, self.own)
         self.claim = np.full(len(label), NONE, np.int32)
+        self.box = np.concatenate(
+            [
+                np.minimum.reduceat(self.points, leaves.first),
+                np.maximum.reduceat(self.points, leaves.first),
+            ],
+            axis=1,
+        )
 
     def set_sides(self) -> None:
         """Say for every surface on which side the air is."""
@@ -399,7 +408,7 @@ def fit_balls(search: Search, zones: Zones) -> Fit:
     )
     return Fit(
         radius=radius * hollow,
-        deviation=np.maximum(rms, 0.3 * noise) / np.sqrt(np.maximum(now[:, 2], 1e-12)),
+        deviation=_SHARED * np.maximum(rms, 0.3 * noise) / np.sqrt(np.maximum(now[:, 2], 1e-12)),
         hollow=hollow,
         turn=turn,
         points=total,
@@ -440,7 +449,27 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
             continue
         search.claim[fresh] = p
         chosen[p] = True
+    drop_weak_claims(search, zones, fit)
     return chosen
+
+
+def drop_weak_claims(search: Search, zones: Zones, fit: Fit) -> None:
+    """Give back points that lie on a side of the fillet as well, unless others are next to them.
+
+    Near the line of contact the ball is as good as the surface; beyond the end of a fillet both go
+    on, and there nothing else lies on the ball.
+    """
+    mine = np.flatnonzero(search.claim >= 0)
+    pair = search.claim[mine]
+    side = (search.label[mine][:, None] == zones.pairs[pair]).any(axis=1)
+    weak = side & (search.off[mine] <= _WEAK * search.noise)
+    mark = search.claim.copy()
+    mark[mine[weak]] = NONE
+    mine, pair = mine[weak], pair[weak]
+    leaf = np.searchsorted(search.leaves.first, mine, side="right") - 1
+    reach = np.sqrt(2.0 * _ON * search.noise * np.abs(fit.radius[pair])) + search.spacing
+    far = nearest_marked(search.device[0], mark, search.leaves, search.box, mine, leaf, pair, reach)
+    search.claim[mine[~np.isfinite(far)]] = NONE
 
 
 def refit_sides(search: Search) -> None:
@@ -547,10 +576,7 @@ def mark_points(
     key = np.unique(key)
     pair, leaf = key // len(leaves), key % len(leaves)
     pair, leaf = pair[~idle[pair]], leaf[~idle[pair]]
-    box = np.concatenate(
-        [np.minimum.reduceat(search.points, leaves.first),
-         np.maximum.reduceat(search.points, leaves.first)], axis=1,
-    )  # fmt: skip
+    box = search.box
     wide = 0.5 * np.linalg.norm(box[:, 3:] - box[:, :3], axis=1)
     kept = search.near_edge(
         zones.pairs, radius, 0.5 * (box[:, :3] + box[:, 3:]), leaf, pair, reach + wide[leaf]
@@ -568,10 +594,10 @@ def mark_points(
     tangent = smooth[pair]
     along = np.where(tangent, 0.0, at.along)
     ball = at.region == BALL
-    noise = np.where(ball & chosen[pair], _ON, _CAP) * search.noise
-    near = (along <= reach) & ((np.abs(at.off) <= noise) | tangent | (ball & ~chosen[pair]))
+    fits = (np.abs(at.off) <= np.where(ball, _ON, _CAP) * search.noise) | (ball & ~chosen[pair])
+    near = (along <= reach) & (fits | tangent)
     point, pair, leaf, label = point[near], pair[near], leaf[near], label[near]
-    along, ball = along[near], ball[near]
+    along = along[near]
     other = np.where(label == zones.pairs[pair, 0], zones.pairs[pair, 1], zones.pairs[pair, 0])
     found = np.ones(len(point), bool)
     far = np.where(smooth[pair], reach - 0.5 * search.spacing, along + reach)
@@ -579,7 +605,7 @@ def mark_points(
     held = (search.own[leaf] == other[:, None]).any(axis=1) & (2.0 * wide[leaf] <= far)
     for k, marks, wanted in (
         (np.flatnonzero(~chosen[pair] & ~held), search.label, other),
-        (np.flatnonzero(chosen[pair] & ~ball), search.claim, pair),
+        (np.flatnonzero(chosen[pair]), search.claim, pair),
     ):
         distance = nearest_marked(
             search.device[0], marks, leaves, box, point[k], leaf[k], wanted[k], far[k]

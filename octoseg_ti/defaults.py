@@ -40,10 +40,20 @@ HOMOGENEITY = (7.0, 0.1, 0.25)
 
 SURFACE_NOISE = (1.3, 0.02)
 """A point deviates from its surface by this many standard deviations of the noise, plus so many
-spacings: surfaces are fitted to noisy points, and rounding leaves something on perfect data."""
+spacings, for surfaces are fitted to noisy points."""
+EXACT_NOISE = (0.5, 0.005)
+"""... but of the latter no more than so many standard deviations, plus so many spacings, which
+rounding leaves on perfect data."""
 TURNS = (0.25, 4.0)
 """A sample lies on a surface when its normal is off by no more than this angle [rad], or so many
 deviations of the normals."""
+CHANCE = 0.0015
+"""... or by so much that one in so many points that lie anywhere, at a distance of up to a spacing
+from it, and face anywhere would: where positions are exact they tell by themselves, and normals of
+narrow faces are those of their neighbourhood."""
+EVIDENCE = 105.0
+"""Fewest points of a surface, times the logarithm of how many noises there are in a spacing: the
+more each point tells, the fewer prove a surface."""
 LEAST_TILT = 0.05
 """Deviation of the normals from those of a surface even on perfect data [rad]: edges smear them."""
 
@@ -113,9 +123,22 @@ def derive(params: Params, measured: Measurement) -> Params:
     if surfaces.noise is None:
         times, share = SURFACE_NOISE
         noise = max(measured.noise, measured.surface_noise)
-        surfaces = replace(surfaces, noise=times * noise + share * spacing)
+        more, rounding = EXACT_NOISE
+        off = min(share * spacing, more * noise + rounding * spacing)
+        surfaces = replace(surfaces, noise=times * noise + off)
     if surfaces.tilt is None:
         surfaces = replace(surfaces, tilt=max(LEAST_TILT, measured.normal_noise))
+    exact = math.sqrt(one) / surfaces.noise if one > 0 and surfaces.noise else 1.0
+    if surfaces.turn is None:
+        times, deviations = TURNS
+        by_chance = math.acos(max(0.0, 1.0 - CHANCE * exact))
+        turn = max(times, deviations * surfaces.tilt, by_chance)
+        surfaces = replace(surfaces, turn=turn)
+    if surfaces.min_points is None:
+        fewest = regions.min_points
+        if exact > 1.0:
+            fewest = min(fewest, math.ceil(EVIDENCE / math.log(exact)))
+        surfaces = replace(surfaces, min_points=fewest)
     return replace(
         params,
         cleaning=cleaning,

@@ -118,6 +118,12 @@ class SurfaceParams:
     """Deviation of a point from its surface [mm]; default: from the data."""
     tilt: float | None = None
     """Deviation of its normal [rad]; default: from the noise of the normals."""
+    turn: float | None = None
+    """Largest angle between the normals of a point and of its surface [rad]; default: from the
+    noise, wider where the position of a point tells more."""
+    min_points: int | None = None
+    """A surface with fewer points is none; default: fewer than of a patch where points lie close to
+    their surface."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -102,7 +102,10 @@ def segment(
     with stage("regions"):
         found = grow_regions(grid, leaves, edge, measured, params)
     with stage("surfaces"):
-        measured, params, found = explain_regions(grid, leaves, found, measured, params, asked)
+        curved = arranged.run is None
+        measured, params, found = explain_regions(
+            grid, leaves, found, measured, params, asked, curved=curved
+        )
     with stage("borders"):
         borders = trace_borders(grid, found, measured, params)
     with stage("patches"):
@@ -317,13 +320,22 @@ def explain_regions(
     measured: Measurement,
     params: Params,
     asked: SurfaceParams,
+    *,
+    curved: bool,
 ) -> tuple[Measurement, Params, Regions]:
-    """Find the analytic surfaces of the regions, and give the points to them."""
+    """Find the analytic surfaces of the regions, and give the points to them.
+
+    Where the noise was measured against planes, ``curved``, it contains curvature.
+    """
     extent = grid.size * max(grid.shape)
     # Fits add up fourth powers of lengths, which beyond this leave the range of numbers.
     if not params.surfaces.enabled or not 1.0 / _LONGEST < extent < _LONGEST:
         return measured, params, found
-    measured = replace(measured, surface_noise=surface_noise(grid))
+    scatter = surface_noise(grid, leaves, found.group[leaves])
+    if scatter is not None:
+        measured = replace(measured, surface_noise=scatter)
+        if curved:
+            measured = replace(measured, noise=min(measured.noise, scatter))
     params = derive(replace(params, surfaces=asked), measured)
     return measured, params, fit_surfaces(grid, leaves, found, params)
 

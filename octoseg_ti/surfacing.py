@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from octoseg_ti.defaults import TURNS
 from octoseg_ti.device import runtime
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.params import Params
@@ -40,8 +39,12 @@ from octoseg_ti.types import NONE
 _ROUNDS = 2
 # Points of a leaf that speak for it: of all its points, and of those that fit nothing.
 _SAMPLES, _REST = 4, 6
-# A leaf takes part in a new group when so many of its points fit nothing.
-_LEFT_POINTS = 2
+# ... and with the points around those; what these count.
+_AROUND, _HARDLY = 12, 1e-3
+# The normals of narrow faces, and of points at edges, may be off so many times more than others.
+_NARROW = 2.0
+# A leaf takes part in a new group when so many of its points fit nothing, or one in so many.
+_LEFT_POINTS, _LEFT_SHARE = 2, 3
 # Samples for fitting a surface anew.
 _REFIT = 300
 # ... away from other surfaces, if there are so many of these.
@@ -98,9 +101,17 @@ class _Search:
         table = surface_table(self.surfaces.kind, self.surfaces.parameters, _HANDICAP * late)
         self.own = self.labelling.choose(self.own, table, passes=passes, closed=self.free)
 
-    def add(self, samples: Samples, sets: list[np.ndarray], *, apart: bool = True) -> bool:
+    def add(
+        self,
+        samples: Samples,
+        sets: list[np.ndarray],
+        *,
+        apart: bool = True,
+        turn: float | None = None,
+    ) -> bool:
         """Explain sets of samples; say whether that gave any new surface."""
-        new, label = explain(samples, self.leaves, sets, self.tolerance, apart=apart)
+        tolerance = self.tolerance if turn is None else self.tolerance._replace(turn=turn)
+        new, label = explain(samples, self.leaves, sets, tolerance, apart=apart)
         for members in sets:
             large = samples.weight[members].sum() >= _FREE * self.tolerance.points
             explained = np.any(label[members] >= 0)
@@ -159,17 +170,28 @@ class _Search:
         cell = np.nonzero(there)[0]
         self.own = own_lists(self.leaves, cell, name[self.own[there]])
 
-    def rest(self) -> tuple[Samples, list[np.ndarray]]:
-        """Return samples of the points that fit nothing, in connected sets."""
+    def rest(self, *, around: bool = False) -> tuple[Samples, list[np.ndarray]]:
+        """Return samples of the points that fit nothing, in connected sets.
+
+        Points ``around`` them come with them, but hardly count: a narrow face shares most of its
+        points with the faces beside it.
+        """
         label, leaves = self.label, self.leaves
         left = np.add.reduceat((label < 0).astype(np.int32), leaves.first)
-        there = (left >= _LEFT_POINTS) & ~self.free & ~self.face
+        there = (left > 0) & ~self.free & ~self.face
+        if not around:
+            there &= (left >= _LEFT_POINTS) | (_LEFT_SHARE * left >= leaves.count)
         both = there[leaves.a] & there[leaves.b]
         root = components(len(leaves), leaves.a[both], leaves.b[both])
         size = np.bincount(root[there], left[there], minlength=len(leaves))
         kept = there & (size[root] >= self.tolerance.points)
-        blocked = np.where(np.repeat(kept, leaves.count), label, 0).astype(np.int32)
-        samples = sample_leaves(self.grid, leaves, _REST, label=blocked)
+        blocked = np.where(np.repeat(kept, leaves.count), NONE if around else label, 0)
+        samples = sample_leaves(
+            self.grid, leaves, _AROUND if around else _REST, label=blocked.astype(np.int32)
+        )
+        if around:
+            weight = np.where(label[samples.index] < 0, samples.weight, _HARDLY)
+            samples = replace(samples, weight=weight)
         part = root[samples.leaf]
         order = np.argsort(part, kind="stable")
         cut = np.flatnonzero(np.diff(part[order])) + 1
@@ -249,6 +271,12 @@ def find_surfaces(
             break
     else:
         search.choose(passes=2)
+    rest, sets = search.rest(around=True)
+    # Normals of narrow faces are those of the faces beside them.
+    if sets and search.add(rest, sets, turn=_NARROW * tolerance.turn):
+        search.choose(passes=2)
+        search.refit()
+        search.choose()
     for _ in range(_MERGES):
         merged = search.merge()
         if not search.give_up() and not merged:
@@ -275,16 +303,18 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         found: The regions of the flood fill. Those that no analytic surface explains are kept.
         params: Parameters, all filled in.
     """
-    noise, tilt = params.surfaces.noise, params.surfaces.tilt
+    chosen = params.surfaces
+    noise, tilt, turn, fewest = chosen.noise, chosen.tilt, chosen.turn, chosen.min_points
     least = params.regions.min_points
-    assert noise is not None and tilt is not None and least is not None
+    assert noise is not None and tilt is not None and turn is not None
+    assert fewest is not None and least is not None
     graph = leaf_graph(grid, leaves.astype(np.int32), found.touching)
-    turn = max(TURNS[0], TURNS[1] * tilt)
     rule = Rule(noise, tilt)
+    rule = rule._replace(turn=max(rule.turn, _NARROW * turn))
     surfaced = find_surfaces(
-        grid, graph, found.group[leaves], found.cut[leaves], Tolerance(noise, turn, least), rule
+        grid, graph, found.group[leaves], found.cut[leaves], Tolerance(noise, turn, fewest), rule
     )
-    label, surface = number_pieces(graph, surfaced, least)
+    label, surface = number_pieces(graph, surfaced, least, fewest)
     # Regions of which surfaces explain less than half stay; they are free forms.
     rest = (label < 0) & (found.label >= 0)
     size = np.bincount(found.label[found.label >= 0], minlength=found.count)
@@ -319,13 +349,16 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
     )
 
 
-def number_pieces(leaves: Leaves, found: Surfaced, least: float) -> tuple[np.ndarray, np.ndarray]:
+def number_pieces(
+    leaves: Leaves, found: Surfaced, least: float, fewest: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Number the connected pieces of the surfaces by size.
 
     Args:
         leaves: The leaves.
         found: The surfaces and their points.
-        least: A piece with fewer points is no patch.
+        least: A piece with fewer points is no patch,
+        fewest: unless it is the largest of its surface and has so many.
 
     Returns:
         Patch of every sorted point, -1 = none, shape (n,), i32; and the surface of every patch.
@@ -339,7 +372,11 @@ def number_pieces(leaves: Leaves, found: Surfaced, least: float) -> tuple[np.nda
     rank = (found.own[cell[others]] == name[others, None]).argmax(axis=1)
     mine[others] = piece[cell[others], rank]
     size = np.bincount(mine)
-    names = np.flatnonzero(size >= max(least, 1))
+    most = np.zeros(len(found.surfaces), np.int64)
+    np.maximum.at(most, name, size[mine])
+    main = np.zeros(len(size), bool)
+    main[mine] = size[mine] == most[name]
+    names = np.flatnonzero(size >= np.where(main, max(fewest, 1), max(least, 1)))
     names = names[np.argsort(-size[names], kind="stable")]
     number = np.full(len(size), NONE, np.int32)
     number[names] = np.arange(len(names), dtype=np.int32)

@@ -128,6 +128,8 @@ class Truth:
     """Distance to the nearest true edge [mm], shape (N,), f32; 0 on a fillet strip."""
     edge_class: np.ndarray | None = None
     """`EdgeClass` of that nearest edge, shape (N,), u8."""
+    radius: np.ndarray | None = None
+    """Radius of the fillet that a point lies on [mm], shape (N,), f32; NaN on no fillet."""
     T_world_view: np.ndarray | None = None
     """True pose of every view: maps view to world, shape (V, 4, 4), f64."""
     artefact: np.ndarray | None = None

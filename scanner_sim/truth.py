@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
-from octoseg_ti.types import NONE, EdgeClass, Truth
+from octoseg_ti.types import NONE, EdgeClass, SurfaceKind, Truth
 from scanner_sim.edges import trace_edges
 from scanner_sim.faces import goes_on
 from scanner_sim.links import components, in_doubt, link_mesh
@@ -59,8 +59,17 @@ def build_truth(
         normal=normal,
         edge_distance=edge_distance.astype(np.float32),
         edge_class=edge_class,
+        radius=_radii(part)[surface],
         info=info,
     )
+
+
+def _radii(part: FlatPart) -> np.ndarray:
+    """Return the radius of every fillet surface [mm], NaN for others, shape (S,), f32."""
+    surfaces = part.surfaces
+    tube = surfaces.kind == int(SurfaceKind.TORUS)
+    radius = np.where(tube, surfaces.data[:, 7], surfaces.data[:, 6])
+    return np.where(surfaces.fillet, radius, np.nan).astype(np.float32)
 
 
 def find_patches(

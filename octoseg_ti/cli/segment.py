@@ -141,11 +141,31 @@ def summary(result: Segmentation) -> dict[str, Any]:
             }
             for k in range(result.patch_count)
         ],
+        "fillets": fillet_table(result),
         "registration": registration_figures(result.registration),
         "measured": asdict(result.measured),
         "params": result.params.to_dict(),
         "seconds": result.seconds,
     }
+
+
+def fillet_table(result: Segmentation) -> list[dict[str, Any]] | None:
+    """Return a row for every fillet, for JSON; None where they were not looked for."""
+    found = result.fillets
+    if found is None:
+        return None
+    return [
+        {
+            "fillet": k,
+            "patches": found.patches[k].tolist(),
+            "radius_mm": float(found.radius[k]),
+            "deviation_mm": float(found.deviation[k]),
+            "concave": bool(found.concave[k]),
+            "points": int(found.points[k]),
+            "strips": np.flatnonzero(found.strip == k).tolist(),
+        }
+        for k in range(len(found))
+    ]
 
 
 def pose_figures(result: Segmentation, truth: Truth | None) -> dict[str, Any] | None:

@@ -23,21 +23,24 @@ from octoseg_ti.evaluation.points import (
     point_spacing,
     score_artefacts,
     score_edges,
+    score_fillets,
     score_normals,
 )
 from octoseg_ti.evaluation.poses import pose_errors
 from octoseg_ti.evaluation.scores import (
     ArtefactScores,
     EdgeScores,
+    FilletScores,
     NormalScores,
     RegionScores,
     Scores,
 )
-from octoseg_ti.types import EdgeClass, Truth
+from octoseg_ti.types import EdgeClass, Fillets, Truth
 
 __all__ = [
     "ArtefactScores",
     "EdgeScores",
+    "FilletScores",
     "HooverCounts",
     "NormalScores",
     "Overlap",
@@ -81,6 +84,9 @@ def evaluate(
     patch = _labels("true patches", known.patch)
     edge = _column("edge", getattr(result, "edge", None), len(labels))
     normals = _column("normals", getattr(result, "normals", None), len(labels))
+    fillets = getattr(result, "fillets", None)
+    if isinstance(fillets, Fillets):
+        _column("fillets", fillets.point, len(labels))
     outlier = _column("outlier", getattr(result, "outlier", None), len(labels))
     for name, array in (
         ("true patches", patch),
@@ -88,6 +94,7 @@ def evaluate(
         ("true edge classes", known.edge_class),
         ("true normals", known.normal),
         ("true artefacts", known.artefact),
+        ("true radii", known.radius),
     ):
         _column(name, array, len(labels))
 
@@ -131,6 +138,7 @@ def evaluate(
         normals_interior=normal_scores_interior,
         edges=edges,
         edges_note=note,
+        fillets=(score_fillets(fillets, known) if isinstance(fillets, Fillets) else None),
         artefacts=(
             None
             if outlier is None or known.artefact is None

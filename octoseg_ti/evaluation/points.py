@@ -6,8 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from octoseg_ti.evaluation.scores import ArtefactScores, EdgeScores, NormalScores
-from octoseg_ti.types import Artefact, EdgeClass, Truth
+from octoseg_ti.evaluation.scores import (
+    ArtefactScores,
+    EdgeScores,
+    FilletScores,
+    NormalScores,
+)
+from octoseg_ti.types import Artefact, EdgeClass, Fillets, Truth
 
 _SAMPLE = 20_000
 
@@ -95,6 +100,39 @@ def _edge_scores(found: np.ndarray, true: np.ndarray) -> EdgeScores:
         precision=hits / found_count if found_count else float("nan"),
         recall=hits / true_count if true_count else float("nan"),
         f1=2 * hits / (found_count + true_count) if found_count + true_count else float("nan"),
+    )
+
+
+def score_fillets(fillets: Fillets, truth: Truth) -> FilletScores | None:
+    """Score the radii of fillets; None where no true radius is known.
+
+    Args:
+        fillets: The fillets found, with the one that every point lies on.
+        truth: Truth with ``radius``.
+    """
+    if truth.radius is None or not np.isfinite(truth.radius).any():
+        return None
+    there = np.flatnonzero(fillets.point >= 0)
+    owner, true = fillets.point[there], truth.radius[there].astype(np.float64)
+    on = np.isfinite(true)
+    count = len(fillets)
+    points = np.bincount(owner, minlength=count)
+    right = 2 * np.bincount(owner, on, count) > points
+    order = np.lexsort((true[on], owner[on]))
+    lies, value = owner[on][order], true[on][order]
+    begin, end = np.searchsorted(lies, [np.arange(count), np.arange(1, count + 1)])
+    which = np.flatnonzero(right)
+    middle = value[(begin[which] + end[which] - 1) // 2]
+    error = np.abs(fillets.radius[which] / middle - 1.0)
+    weight = points[which] / max(int(points[which].sum()), 1)
+    some = len(error) > 0
+    return FilletScores(
+        found=count,
+        right=len(which),
+        median=float(np.median(error)) if some else float("nan"),
+        worst=float(error.max()) if some else float("nan"),
+        within_5=float(weight[error <= 0.05].sum()) if some else float("nan"),
+        within_10=float(weight[error <= 0.10].sum()) if some else float("nan"),
     )
 
 

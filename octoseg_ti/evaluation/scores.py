@@ -78,6 +78,28 @@ class EdgeScores:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FilletScores:
+    """How well the radii of fillets were found.
+
+    A fillet is right when more than half of its points lie on true fillets; then the error of its
+    radius is told, relative to the median of their true radii.
+    """
+
+    found: int
+    """Fillets found."""
+    right: int
+    """Those that are right."""
+    median: float
+    """Median of the relative errors of their radii, without sign; NaN = none is right."""
+    worst: float
+    """Largest such error."""
+    within_5: float
+    """Share of the points on right fillets whose radius is within 5 %."""
+    within_10: float
+    """... and within 10 %."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ArtefactScores:
     """How well cleaning found the artefacts of the measurement."""
 
@@ -119,6 +141,8 @@ class Scores:
     """Scores of edge points under "all", "sharp" and "fillet"; empty without true edges."""
     edges_note: str
     """Why edge points were not scored; empty when they were."""
+    fillets: FilletScores | None = None
+    """Scores of the radii of fillets; None when the result or the truth has none."""
     artefacts: ArtefactScores | None = None
     """Scores of cleaning; None when the truth does not know artefacts or the result no outliers."""
     table: Overlap
@@ -168,6 +192,11 @@ class Scores:
                 name: {k: _plain(v) for k, v in dataclasses.asdict(score).items()}
                 for name, score in self.edges.items()
             },
+            "fillets": (
+                None
+                if self.fillets is None
+                else {k: _plain(v) for k, v in dataclasses.asdict(self.fillets).items()}
+            ),
             "artefacts": _artefact_dict(self.artefacts),
         }
 
@@ -215,6 +244,13 @@ class Scores:
             )
         else:
             lines.append(f"edge points: not scored ({self.edges_note})")
+        if self.fillets is not None:
+            f = self.fillets
+            lines.append(
+                f"fillets: {f.found} found, {f.right} right; error of the radius: median "
+                f"{f.median:.1%}, largest {f.worst:.1%}; within 5 % for {f.within_5:.1%} of their "
+                f"points, within 10 % for {f.within_10:.1%}"
+            )
         if self.artefacts is not None:
             a = self.artefacts
             lines.append(f"{'cleaning':{width}}  {'precision':>10}  {'recall':>10}  {'F1':>10}")

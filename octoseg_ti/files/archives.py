@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from octoseg_ti.params import Params
-from octoseg_ti.types import Cells, Measurement, Registration, Scans, Segmentation, Truth
+from octoseg_ti.types import Cells, Fillets, Measurement, Registration, Scans, Segmentation, Truth
 
 _SAMPLE = 2048
 _NOISE = 0.95  # deflate would save less than this leaves
@@ -83,7 +83,8 @@ def _reference_bits(reference: np.ndarray) -> np.ndarray:
 def pack_truth(truth: Truth, points: np.ndarray) -> bytes:
     """Return ``ground_truth.npz``: every array of the truth in point order, without loss.
 
-    ``patch``, ``surface``, ``kind``, ``edge_distance``, ``edge_class``, ``artefact`` and
+    ``patch``, ``surface``, ``kind``, ``edge_distance``, ``edge_class``, ``radius``,
+    ``artefact`` and
     ``T_world_view`` are stored as they are; ``position_byte0`` to 7 and ``normal_byte0`` to 7, each
     (N, 3) u8, hold the bytes of the f64 rows, lowest first, the positions XOR those of ``points``.
     This halves the file.
@@ -93,7 +94,8 @@ def pack_truth(truth: Truth, points: np.ndarray) -> bytes:
         points: Positions as a reader of the recording sees them [mm], world frame, shape (N, 3).
     """
     arrays: dict[str, Any] = {"patch": truth.patch, "info": json.dumps(truth.info)}
-    for name in ("surface", "kind", "edge_distance", "edge_class", "artefact", "T_world_view"):
+    for name in ("surface", "kind", "edge_distance", "edge_class", "radius", "artefact",
+                 "T_world_view"):  # fmt: skip
         if getattr(truth, name) is not None:
             arrays[name] = getattr(truth, name)
     if truth.position is not None:
@@ -140,6 +142,9 @@ def result_arrays(result: Segmentation, *, per_point: bool) -> dict[str, Any]:
     arrays["measured"] = np.array(
         [getattr(result.measured, name) for name in _MEASURED_FIELDS], np.float64
     )
+    if result.fillets is not None:
+        for name in _FILLET_FIELDS:
+            arrays[f"fillet_{name}"] = getattr(result.fillets, name)
     if result.registration is not None:
         for name in _REGISTRATION_FIELDS:
             arrays[f"registration_{name}"] = getattr(result.registration, name)
@@ -151,6 +156,10 @@ def result_arrays(result: Segmentation, *, per_point: bool) -> dict[str, Any]:
 
 
 _CELL_FIELDS = ("corner", "size", "level", "count", "normal", "sigma", "stop", "edge", "label")
+_FILLET_FIELDS = {
+    "patches": np.int32, "radius": np.float64, "deviation": np.float64, "concave": np.uint8,
+    "points": np.int32, "strip": np.int32, "point": np.int32,
+}  # fmt: skip
 _REGISTRATION_FIELDS = {
     "recorded": np.float64, "refined": np.float64, "datum": np.int32, "left": np.int32,
     "open": np.int32, "pairs": np.int32, "matches": np.int32, "before": np.float64,
@@ -212,6 +221,19 @@ def result_from_arrays(arrays: Mapping[str, Any]) -> Segmentation:
         if any(len(stored[name]) != pairs for name in ("matches", "before", "after")):
             raise ValueError(f"the registration differs in length from its {pairs} pairs")
         aligned = Registration(**stored)
+    fillets = None
+    if "fillet_radius" in arrays:
+        fillets = Fillets(
+            **{
+                name: np.ascontiguousarray(arrays[f"fillet_{name}"], dtype)
+                for name, dtype in _FILLET_FIELDS.items()
+            }
+        )
+        of_fillet = (fillets.patches, fillets.deviation, fillets.concave, fillets.points)
+        if any(len(values) != len(fillets) for values in of_fillet):
+            raise ValueError(f"the arrays of the {len(fillets)} fillets differ in length")
+        if len(fillets.strip) != patches or len(fillets.point) != len(points):
+            raise ValueError("the fillets belong to other patches or points")
     names = [str(name) for name in np.asarray(arrays["stage_names"])]
     seconds = np.asarray(arrays["stage_seconds"], np.float64).tolist()
     measured = np.asarray(arrays["measured"], np.float64).tolist()
@@ -220,6 +242,7 @@ def result_from_arrays(arrays: Mapping[str, Any]) -> Segmentation:
         cells=Cells(initial_size=float(arrays["initial_size"]), **cells),
         params=Params.from_dict(json.loads(str(arrays["params"]))),
         measured=Measurement(**dict(zip(_MEASURED_FIELDS, measured, strict=True))),
+        fillets=fillets,
         registration=aligned,
         passes=int(arrays["passes"]),
         seconds=dict(zip(names, seconds, strict=True)),

@@ -40,6 +40,8 @@ def table(
     if isinstance(what, Segmentation):
         columns["label"] = what.labels
         names: tuple[str, ...] = ("edge", "level", "outlier", "stripe", "view")
+        if what.fillets is not None:
+            columns["fillet"] = what.fillets.point
         rgba = colors(what.labels)
     else:
         names = ("stripe", "column", "view")
@@ -49,7 +51,15 @@ def table(
     columns |= {name: getattr(what, name) for name in names if getattr(what, name) is not None}
     columns |= {name: rgba[:, i] for i, name in enumerate(("red", "green", "blue"))}
     if truth is not None:
-        for name in ("patch", "surface", "kind", "edge_distance", "edge_class", "artefact"):
+        for name in (
+            "patch",
+            "surface",
+            "kind",
+            "edge_distance",
+            "edge_class",
+            "radius",
+            "artefact",
+        ):
             if getattr(truth, name) is not None:
                 columns[f"truth_{name}"] = getattr(truth, name)
     return columns

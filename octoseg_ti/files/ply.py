@@ -24,7 +24,7 @@ from octoseg_ti.files import range_grid
 from octoseg_ti.files.atomic import replacing
 from octoseg_ti.files.columns import MM, rows, scan_values, table
 from octoseg_ti.files.validation import existing_file, make_scans, parsing
-from octoseg_ti.types import Scans, Segmentation, Truth
+from octoseg_ti.types import Fillets, Scans, Segmentation, Truth
 
 _HINT = "a PLY file with an element `vertex` of x, y, z is wanted"
 
@@ -70,7 +70,9 @@ def write(
 ) -> None:
     """Write binary PLY: a vertex property for everything that a point has, colours by label.
 
-    A result also has an element ``patch`` with kind, surface, residual and parameters.
+    A result also has an element ``patch`` with kind, surface, residual and parameters, and an
+    element ``fillet`` with the patches that a fillet runs between, its radius and the deviation of
+    that.
 
     Raises:
         DataError: The output cannot be written.
@@ -78,6 +80,8 @@ def write(
     elements = [PlyElement.describe(rows(table(path, what, truth)), "vertex")]
     if isinstance(what, Segmentation):
         elements.append(PlyElement.describe(_patch_rows(what), "patch"))
+        if what.fillets is not None:
+            elements.append(PlyElement.describe(_fillet_rows(what.fillets), "fillet"))
     comments = [f"octoseg {__version__}", "unit mm", "edge 0 none, 1 sharp, 2 fillet, 3 smooth"]
     content = PlyData(elements, byte_order="<", comments=comments)
     with replacing(path, overwrite=overwrite) as output:
@@ -94,6 +98,19 @@ def _patch_rows(result: Segmentation) -> np.ndarray:
     for i, name in enumerate(names):
         patches[name] = result.parameters[:, i]
     return patches
+
+
+def _fillet_rows(fillets: Fillets) -> np.ndarray:
+    """Return a row per fillet: its two patches, radius and deviation [mm], side and points."""
+    layout = [
+        ("patch_a", "<i4"), ("patch_b", "<i4"), ("radius", "<f8"), ("deviation", "<f8"),
+        ("concave", "u1"), ("points", "<i4"),
+    ]  # fmt: skip
+    found = np.empty(len(fillets), np.dtype(layout))
+    found["patch_a"], found["patch_b"] = fillets.patches.T
+    for name in ("radius", "deviation", "concave", "points"):
+        found[name] = getattr(fillets, name)
+    return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

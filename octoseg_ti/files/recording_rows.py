@@ -130,7 +130,7 @@ def truth_rows(truth: Truth, scan: np.ndarray, points: np.ndarray) -> np.ndarray
 
 
 _PER_POINT = ("patch", "surface", "kind", "position", "normal", "edge_distance", "edge_class",
-              "artefact")  # fmt: skip
+              "radius", "artefact")  # fmt: skip
 
 
 def part_of(truth: Truth, rows: slice) -> Truth:

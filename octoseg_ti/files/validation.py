@@ -155,12 +155,13 @@ def make_truth(path: str | Path | None, values: dict[str, Any], count: int | Non
     for name in ("position", "normal"):
         if name in given:
             fields[name] = _rows(path, name, given[name], n)
-    if "edge_distance" in given:
-        distance = np.asarray(given["edge_distance"])
-        if distance.shape != (n,) or distance.dtype.kind not in "fiu":
-            what = f"edge_distance has shape {distance.shape}, not ({n},)"
-            raise DataError(what, path=path, hint="give one distance per point")
-        fields["edge_distance"] = np.ascontiguousarray(distance, np.float32)
+    for name in ("edge_distance", "radius"):
+        if name in given:
+            length = np.asarray(given[name])
+            if length.shape != (n,) or length.dtype.kind not in "fiu":
+                what = f"{name} has shape {length.shape}, not ({n},)"
+                raise DataError(what, path=path, hint="give one length per point")
+            fields[name] = np.ascontiguousarray(length, np.float32)
     fields["T_world_view"] = _poses(path, given.get("T_world_view"))
     info = given.get("info", {})
     fields["info"] = json.loads(info) if isinstance(info, str) else dict(info)

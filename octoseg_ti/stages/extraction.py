@@ -24,11 +24,13 @@ _WHOLE = 0.85
 _SURE = 0.9
 # Samples for one fit of a set, and of a growing surface.
 _MANY, _SOME = 200, 150
-# Neighbourhoods of a seed, in samples.
-_NEAR = (20, 60, 150)
+# Neighbourhoods of a seed, in samples; and one of less, down to this share of the smallest surface,
+# where small ones count.
+_NEAR, _LEAST_NEAR, _SHARE_NEAR = (20, 60, 150), 12, 0.6
 # Samples of a set that tell how much a candidate explains.
 _SCORED = 3000
-# Seeds of a set, and into how many looks they are divided: each looks at what is left.
+# Seeds of a set, two for the smallest surface at least, and into how many looks they are divided:
+# each looks at what is left.
 _SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS, _LOOKS = 40, 8, 200, 2
 # A surface grows until it gains less than this, at most so often.
 _GAIN, _GROWTHS = 1.02, 4
@@ -40,6 +42,9 @@ _TOGETHER, _KEPT = 0.5, 0.8
 # more than so many noises, fewer the less they explain and the more of it neighbours share: pieces
 # of a free form are cut out as far as they just fit, and leave gaps and waves.
 _COVERED, _REAL = 0.6, 1.75
+# ... and at any rate when this share of them is nearer than so many noises: of noise that is half,
+# of what is cut out as far as it just fits a sixth.
+_EXACT, _MOSTLY = 0.5, 0.75
 
 
 class Tolerance(NamedTuple):
@@ -130,7 +135,9 @@ def _neighborhoods(point: np.ndarray, seeds: np.ndarray, count: int) -> np.ndarr
 class _Set:
     """A set that is taken apart: what is left of it, and its candidates."""
 
-    def __init__(self, samples: Samples, leaves: Leaves, members: np.ndarray) -> None:
+    def __init__(
+        self, samples: Samples, leaves: Leaves, members: np.ndarray, fewest: float
+    ) -> None:
         self.members = members
         self.weight = samples.weight[members]
         self.free = np.ones(len(members), bool)
@@ -140,9 +147,13 @@ class _Set:
         a, b = inside[leaves.a], inside[leaves.b]
         both = (a >= 0) & (b >= 0)
         self.a, self.b = a[both], b[both]
-        self.total = np.bincount(self.place, minlength=len(self.leaf))
-        self.seeds = int(np.clip(len(members) // _SEED_EVERY, _LEAST_SEEDS, _MOST_SEEDS))
+        self.total = np.bincount(self.place, weights=self.weight, minlength=len(self.leaf))
+        self.seeds = int(
+            np.clip(len(members) / min(_SEED_EVERY, fewest / 2.0), _LEAST_SEEDS, _MOST_SEEDS)
+        )
         self.each = max(self.seeds // _LOOKS, _LEAST_SEEDS)
+        least = int(max(_LEAST_NEAR, _SHARE_NEAR * fewest))
+        self.near = (least, *_NEAR) if least < _NEAR[0] else _NEAR
         self.scored = np.zeros(0, np.int64)
         self.on = np.zeros((0, 0), np.float32)
         self.surfaces = no_surfaces()
@@ -153,7 +164,7 @@ class _Set:
         seeds = spread(np.arange(len(left)), min(self.each, self.seeds))
         self.seeds -= self.each
         near: list[np.ndarray] = []
-        for count in _NEAR:
+        for count in self.near:
             near += list(left[_neighborhoods(point[left], seeds, min(count, len(left)))])
             if count >= len(left):
                 break
@@ -161,7 +172,7 @@ class _Set:
 
     def connected(self, on: np.ndarray) -> np.ndarray:
         """Return the largest connected part of some members, bool."""
-        share = np.bincount(self.place, weights=on, minlength=len(self.leaf))
+        share = np.bincount(self.place, weights=on * self.weight, minlength=len(self.leaf))
         there = 2 * share >= self.total
         joined = there[self.a] & there[self.b]
         root = components(len(self.leaf), self.a[joined], self.b[joined])
@@ -223,7 +234,7 @@ def _take_apart(
     """Find the surfaces of sets that no single one explains."""
     label = np.full(len(samples), NONE, np.int32)
     found = no_surfaces()
-    active = [_Set(samples, leaves, members) for members in sets]
+    active = [_Set(samples, leaves, members, tolerance.points) for members in sets]
     while active:
         _find_candidates(samples, active, tolerance)
         gained: dict[_Set, None] = {}
@@ -243,28 +254,29 @@ def _take_apart(
             going = [w for w in taken if not w.ended(tolerance.points)]
             gained |= taken
         active = [w for w in gained if w.seeds > 0 and not w.ended(tolerance.points)]
-    return _real_ones(samples, sets, found, label, _REAL * tolerance.noise)
+    return _real_ones(samples, sets, found, label, tolerance.noise)
 
 
 def _real_ones(
-    samples: Samples, sets: list[np.ndarray], found: Surfaces, label: np.ndarray, limit: float
+    samples: Samples, sets: list[np.ndarray], found: Surfaces, label: np.ndarray, noise: float
 ) -> tuple[Surfaces, np.ndarray]:
     """Drop the surfaces of sets that are free forms."""
     real = np.zeros(len(found) + 1, bool)
     for members in sets:
         name, weight = label[members], samples.weight[members]
         on = name >= 0
-        covered = weight[on].sum() / weight.sum()
-        if covered < _COVERED:
+        if not on.any():
             continue
-        far, _ = evaluate_surfaces(
-            samples.point[members[on]], name[on], found.kind, found.parameters
-        )
-        rms = np.sqrt(np.average(far**2, weights=weight[on]))
-        pair = name[on][1:] == name[on][:-1]
+        name, weight, total = name[on], weight[on], weight.sum()
+        far, _ = evaluate_surfaces(samples.point[members[on]], name, found.kind, found.parameters)
+        covered = weight.sum() / total
+        rms = np.sqrt(np.average(far**2, weights=weight))
+        pair = name[1:] == name[:-1]
         product, square = far[1:][pair] * far[:-1][pair], far[1:][pair] ** 2
         shared = max(0.0, float(product.sum()) / max(float(square.sum()), 1e-300))
-        real[name[on]] = (1.0 + shared) * rms <= covered * limit
+        real[name] = covered >= _COVERED and (1.0 + shared) * rms <= covered * _REAL * noise
+        near = np.bincount(name, weight * (np.abs(far) <= _EXACT * noise), len(found))
+        real[:-1] |= near > _MOSTLY * np.maximum(np.bincount(name, weight, len(found)), 1e-300)
     kept = np.flatnonzero(real[:-1])
     number = np.full(len(real), NONE, np.int32)
     number[kept] = np.arange(len(kept), dtype=np.int32)

@@ -128,7 +128,9 @@ def _choose(
                     if m.norm_sqr() == 0.0:
                         angle = 0.0
                     turn = angle / rule[1]
-                    tilt = ti.min(turn, 6.0)
+                    # Beyond six deviations hardly more: of two surfaces through a point of an edge
+                    # the one that it faces a little.
+                    tilt = ti.min(turn, 6.0 + 0.1 * ti.max(turn - 6.0, 0.0))
                     this = vec3(least + tilt * tilt, off, turn)
                     if angle <= rule[3]:
                         if off <= rule[2] and this[0] < best[0]:

@@ -60,6 +60,8 @@ class Samples:
     """Unit normal, shape (A, 3), f64."""
     weight: np.ndarray
     """How many points a sample stands for, shape (A,), f64."""
+    signed: bool = True
+    """Normals have a side; without one only their axes count."""
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -181,6 +183,7 @@ def sample_leaves(
         point=runtime.download(grid.point)[picked],
         normal=runtime.download(grid.normal)[picked],
         weight=np.repeat(there / np.maximum(each, 1), each),
+        signed=grid.signed,
     )
 
 

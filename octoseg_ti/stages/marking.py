@@ -1,4 +1,4 @@
-"""Which points have others near them that carry a certain mark: a label, or the number of an edge."""
+"""Which points have others near them with a certain mark: a label, or the number of an edge."""
 
 import numpy as np
 

@@ -3,8 +3,10 @@
 Second differences along a stripe see what two neighbours do not share. What decides whether a point
 lies on a surface is more than that: steps of the range, speckle over several points, views that do
 not quite meet. It is measured where it matters, as the residual of the best analytic surface
-through neighbourhoods of about a hundred points: of half of them, for edges run through the others.
-A quadric does for most of them; where it bends too much, surfaces are fitted.
+through neighbourhoods of about a hundred points of one region: of half of them, for edges run
+through some of the others. (Where faces are a few neighbourhoods large, edges would run through
+nearly all if regions did not keep them apart.) A quadric does for most of them; where it bends too
+much, surfaces are fitted.
 """
 
 import numpy as np
@@ -17,38 +19,54 @@ from octoseg_ti.stages.quadrics import QUADRIC_FREEDOM, fit_quadrics
 # Neighbourhoods, and the points of each.
 _COUNT, _POINTS = 256, 128
 _FEWEST = 24
+# The points of a neighbourhood are among so many times as many in Morton order.
+_WINDOW = 4
 # The median counts, up to so many times the lower quartile: edges may run through most.
-_CALM, _MIDDLE, _EDGES = 0.25, 0.5, 1.5
+_CALM, _MIDDLE, _EDGES = 0.25, 0.6, 1.5
 # A quadric is no surface any more where it turns by so much from the middle to the rim [rad].
 _BEND = 0.35
 # Where it leaves so many times what it leaves of the calm ones, there is an edge.
 _EDGE = 8.0
 
 
-def surface_noise(grid: Grid) -> float:
+def surface_noise(grid: Grid, leaves: np.ndarray, group: np.ndarray) -> float | None:
     """Return the standard deviation of points about the surface through their neighbourhood [mm].
 
     Args:
         grid: The sparse grid: points that follow one another in Morton order are near each other.
+        leaves: The nodes that are leaves, in Morton order, shape (C,).
+        group: Region of every leaf, -1 = none, shape (C,), i32.
+
+    Returns:
+        The deviation; None where no region is large enough to tell.
     """
     key = runtime.download(grid.key)
-    n = len(key)
-    begin = np.unique(np.arange(_COUNT) * n // _COUNT)
+    region = np.repeat(group, grid.holds[leaves])
+    inside = np.flatnonzero(region >= 0)
+    if len(inside) == 0:
+        return None
     # Whole boxes: which points of a box come first would depend on the order of the input.
-    first = np.searchsorted(key, key[begin])
-    last = np.searchsorted(key, key[np.minimum(first + _POINTS, n - 1)])
-    fits = (last - first >= _FEWEST) & (last - first <= 4 * _POINTS)
-    first, count = np.unique(first[fits], return_index=True)
-    count = last[fits][count] - first
-    if len(first) == 0:
-        return 0.0
-    ends = np.cumsum(count)
-    index = np.arange(ends[-1]) + np.repeat(first - (ends - count), count)
+    starts = np.unique(
+        np.searchsorted(key, key[inside[np.arange(_COUNT) * len(inside) // _COUNT]])
+    )
+    ends = np.searchsorted(key, key[np.minimum(starts + _WINDOW * _POINTS, len(key) - 1)])
+    found: dict[tuple[int, int], np.ndarray] = {}
+    for first, last in zip(starts, ends, strict=True):
+        mine = first + np.flatnonzero(region[first:last] == region[first])
+        if len(mine) > _POINTS:
+            mine = mine[: np.searchsorted(key[mine], key[mine[_POINTS - 1]], "right")]
+        if len(mine) >= _FEWEST and region[first] >= 0:
+            found[int(mine[0]), int(mine[-1])] = mine
+    if not found:
+        return None
+    count = np.array([len(mine) for mine in found.values()])
+    begin = np.cumsum(count) - count
+    index = np.concatenate(list(found.values()))
     point = runtime.download(grid.point)[index]
     # In an order that has nothing to do with that of the input.
-    order = np.lexsort((*point.T, np.repeat(np.arange(len(first)), count)))
+    order = np.lexsort((*point.T, np.repeat(np.arange(len(count)), count)))
     point, normal = point[order], runtime.download(grid.normal)[index[order]]
-    rms = _residuals(point, normal, np.concatenate([[0], ends]))
+    rms = _residuals(point, normal, np.append(begin, len(index)))
     calm, middle = np.quantile(rms, [_CALM, _MIDDLE])
     return float(min(middle, _EDGES * calm))
 

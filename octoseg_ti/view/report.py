@@ -62,6 +62,9 @@ def sections(
         _grid(result),
         _patches(result),
     ]
+    fillets = _fillets(result)
+    if fillets is not None:
+        out.append(fillets)
     if result.registration is not None:
         out.append(_registration(result.registration))
     if scores is not None:
@@ -187,6 +190,28 @@ def _patches(result: Segmentation) -> Section:
         )
     head = ("patch", "kind", "surface", "points", "rms [mm]", "fitted")
     return Section(title=f"{result.patch_count} patches", head=head, rows=rows)
+
+
+def _fillets(result: Segmentation) -> Section | None:
+    found = result.fillets
+    if found is None or len(found) == 0:
+        return None
+    rows = [
+        (
+            str(k),
+            f"{found.radius[k]:.3f}",
+            f"{found.deviation[k]:.3f}",
+            "concave" if found.concave[k] else "convex",
+            " and ".join(str(patch) for patch in found.patches[k]),
+            f"{found.points[k]:,}",
+            ", ".join(str(patch) for patch in np.flatnonzero(found.strip == k)) or "-",
+        )
+        for k in range(len(found))
+    ]
+    head = ("fillet", "radius [mm]", "deviation [mm]", "side", "between", "points", "strips")
+    text = "Rounds that a ball leaves that touches two patches; strips are patches on such a round."
+    title = f"{len(found)} fillets"
+    return Section(title=title, paragraphs=[text], head=head, rows=rows)
 
 
 def _surface_text(kind: SurfaceKind, parameters: np.ndarray) -> str:

@@ -19,7 +19,7 @@ def assert_equal(left: Any, right: Any, *, but: tuple[str, ...] = ()) -> None:
             assert isinstance(b, np.ndarray), field.name
             assert a.dtype == b.dtype, field.name
             np.testing.assert_array_equal(a, b, err_msg=field.name)
-        elif dataclasses.is_dataclass(a) and field.name == "cells":
+        elif dataclasses.is_dataclass(a) and field.name in ("cells", "fillets"):
             assert_equal(a, b)
         else:
             assert a == b, field.name

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from octoseg_ti.params import Params
-from octoseg_ti.types import Cells, Measurement, Scans, Segmentation, Truth
+from octoseg_ti.types import Cells, Fillets, Measurement, Scans, Segmentation, Truth
 
 
 def make(
@@ -68,6 +68,7 @@ def make(
         normal=normal,
         edge_distance=np.abs(np.sin(x) * y).astype(np.float32),
         edge_class=(column % 3).astype(np.uint8),
+        radius=np.where(column % 5 == 0, 1.5, np.nan).astype(np.float32),
         artefact=(column % 4).astype(np.uint8),
         info={"part": "factory", "seed": str(seed), "noise": str(noise)},
     )
@@ -121,6 +122,15 @@ def make_result(scans: Scans, truth: Truth, *, cells: int = 200, seed: int = 0) 
         label=rng.integers(-1, patches, cells).astype(np.int32),
         initial_size=8.0,
     )
+    fillets = Fillets(
+        patches=rng.integers(0, patches, (5, 2)).astype(np.int32),
+        radius=rng.random(5),
+        deviation=0.01 * rng.random(5),
+        concave=rng.integers(0, 2, 5).astype(np.uint8),
+        points=rng.integers(0, n, 5).astype(np.int32),
+        strip=rng.integers(-1, 5, patches).astype(np.int32),
+        point=rng.integers(-1, 5, n).astype(np.int32),
+    )
     return Segmentation(
         points=scans.points,
         normals=normals,
@@ -133,6 +143,7 @@ def make_result(scans: Scans, truth: Truth, *, cells: int = 200, seed: int = 0) 
         parameters=parameters,
         residual=rng.random(patches),
         cells=grid,
+        fillets=fillets,
         stripe=scans.stripe,
         view=scans.view,
         params=Params(),

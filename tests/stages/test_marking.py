@@ -1,0 +1,67 @@
+"""The nearest point with a mark: the same as by looking at all points."""
+
+import math
+
+import numpy as np
+import pytest
+from reference import rolling
+
+from octoseg_ti.device import runtime
+from octoseg_ti.stages.leaves import Leaves
+from octoseg_ti.stages.marking import nearest_marked
+
+
+def leaves_of(points: np.ndarray, size: float) -> tuple[Leaves, np.ndarray, np.ndarray]:
+    """Cells of one size as leaves, the order of the points by cells, and the box of each."""
+    cell = np.floor(points / size).astype(np.int64)
+    shape = tuple(cell.max(axis=0) + 1)
+    key = np.ravel_multi_index(tuple(cell.T), shape)
+    order = np.argsort(key, kind="stable")
+    name, first, count = np.unique(key[order], return_index=True, return_counts=True)
+    at = np.array(np.unravel_index(name, shape)).T
+    touch = (np.abs(at[:, None] - at[None]) <= 1).all(axis=2) & ~np.eye(len(at), dtype=bool)
+    one, other = np.nonzero(touch)
+    start = np.concatenate([[0], np.cumsum(touch.sum(axis=1))]).astype(np.int32)
+    low = np.array([points[order[f : f + c]].min(axis=0) for f, c in zip(first, count)])  # noqa: B905
+    high = np.array([points[order[f : f + c]].max(axis=0) for f, c in zip(first, count)])  # noqa: B905
+    a, b = one[one < other], other[one < other]
+    leaves = Leaves(
+        node=np.arange(len(name), dtype=np.int32), first=first.astype(np.int32),
+        count=count.astype(np.int32), size=np.full(len(name), size), a=a.astype(np.int32),
+        b=b.astype(np.int32), start=start, neighbor=other.astype(np.int32),
+    )  # fmt: skip
+    return leaves, order, np.column_stack([low, high])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_equal_the_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, 6, (700, 3)) * (1, 1, 0.3)
+    leaves, order, box = leaves_of(points, 1.0)
+    points = points[order]
+    mark = rng.choice([-1, 0, 1, 7], 700, p=[0.4, 0.3, 0.29, 0.01]).astype(np.int32)
+    asked = rng.integers(0, 700, 200)
+    leaf = np.searchsorted(leaves.first, asked, side="right") - 1
+    wanted = rng.choice([0, 1, 7], 200)
+    reach = rng.uniform(0.1, 0.99, 200)
+    runtime.ensure_started()
+    device = runtime.upload(points)
+    got = nearest_marked(device, mark, leaves, box, asked, leaf, wanted, reach, exact=True)
+    expected = [
+        rolling.nearest(points, mark, i, w, r) for i, w, r in zip(asked, wanted, reach, strict=True)
+    ]
+    np.testing.assert_allclose(got, expected)
+    some = nearest_marked(device, mark, leaves, box, asked, leaf, wanted, reach)
+    np.testing.assert_array_equal(np.isfinite(some), np.isfinite(expected))
+    assert 0 < np.isfinite(expected).sum() < 200
+
+
+def test_nothing_asked_nothing_found() -> None:
+    leaves, _, box = leaves_of(np.zeros((3, 3)), 1.0)
+    none = np.zeros(0, np.int64)
+    runtime.ensure_started()
+    points = runtime.upload(np.zeros((3, 3)))
+    assert len(nearest_marked(points, np.zeros(3), leaves, box, none, none, none, none)) == 0
+    one = np.zeros(1, np.int64)
+    far = nearest_marked(points, np.full(3, 2), leaves, box, one, one, one + 5, np.ones(1))
+    assert math.isinf(far[0])

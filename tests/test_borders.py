@@ -1,0 +1,77 @@
+"""Edges and fillets of simple parts of which all is known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from octoseg_ti import evaluate, segment
+from octoseg_ti.evaluation import Scores
+from octoseg_ti.params import EdgeParams, Params
+from octoseg_ti.types import EdgeClass, Segmentation, SurfaceKind
+from scanner_sim import StripeScanner, simulate
+from scanner_sim.part import Part, box, cylinder, half_space, intersection, union
+
+def bend(radius: float, turn_deg: float, *, fillet: bool, wide: float = 8.0) -> Part:
+    """A ridge of two planes along x, rounded by a cylinder."""
+    limits = box((-wide, -wide, -20), (wide, wide, 5))
+    half = math.radians(turn_deg) / 2.0
+    sides = [half_space((0, 0, 0), (0, sign * math.sin(half), math.cos(half))) for sign in (-1, 1)]
+    wedge = intersection(*sides)
+    if radius == 0.0:
+        return intersection(wedge, limits)
+    top = -radius * math.tan(half) * math.sin(half)
+    roll = cylinder((0, 0, -radius / math.cos(half)), (1, 0, 0), radius, fillet=fillet)
+    below = intersection(wedge, half_space((0, 0, top), (0, 0, 1)))
+    above = intersection(wedge, roll, half_space((0, 0, top), (0, 0, -1)))
+    return intersection(union(below, above), limits)
+
+
+def scanned(part: Part, noise: float, params: Params | None = None) -> tuple[Segmentation, Scores]:
+    scans, truth = simulate(part, StripeScanner(stripe_pitch=0.25, range_noise=noise), seed=3)
+    result = segment(scans, params)
+    return result, evaluate(result, truth)
+
+
+@pytest.mark.parametrize(
+    ("radius", "noise", "limit"),
+    [(0.75, 0.01, 0.05), (3.0, 0.01, 0.05), (0.75, 0.025, 0.1), (1.5, 0.025, 0.1)],
+)
+def test_a_fillet_between_planes(radius: float, noise: float, limit: float) -> None:
+    result, scores = scanned(bend(radius, 90.0, fillet=True), noise)
+    found = result.fillets
+    assert found is not None and len(found) == 1
+    assert abs(found.radius[0] / radius - 1.0) < limit
+    assert 0.0 < found.deviation[0] < limit * radius and not found.concave[0]
+    sides = result.kind[found.patches[0]]
+    assert (sides == SurfaceKind.PLANE).all()
+    assert found.points[0] == np.count_nonzero(found.point == 0)
+    assert scores.edges["fillet"].recall >= 0.95 and scores.edges["fillet"].precision >= 0.95
+    assert scores.fillets is not None and scores.fillets.within_10 == 1.0
+
+
+@pytest.mark.parametrize("radius", [1.5, 3.0, 12.0])
+def test_tangent_joints_are_patches(radius: float) -> None:
+    turn = 90.0 if radius < 12.0 else 40.0
+    result, scores = scanned(bend(radius, turn, fillet=False), 0.01)
+    assert scores.regions.correct == scores.regions.patches
+    assert result.fillets is not None
+    if radius > 3.0:
+        assert len(result.fillets) == 0 and np.any(result.edge == EdgeClass.SMOOTH)
+    else:
+        assert np.count_nonzero(result.fillets.strip >= 0) == 1
+
+
+@pytest.mark.parametrize("turn", [3.0, 5.0, 10.0])
+def test_shallow_ridges_are_two_patches(turn: float) -> None:
+    result, scores = scanned(bend(0.0, turn, fillet=False, wide=14.0), 0.005)
+    assert scores.regions.correct == scores.regions.patches
+    assert result.fillets is not None and len(result.fillets) == 0
+    assert scores.edges["sharp"].precision > 0.8 and scores.edges["sharp"].recall > 0.6
+
+
+def test_fillets_can_be_left_out() -> None:
+    params = Params(edges=EdgeParams(fillet_radius=0.0))
+    result, _ = scanned(bend(1.5, 90.0, fillet=True), 0.01, params)
+    assert result.fillets is not None and len(result.fillets) == 0
+    assert not np.any(result.edge == EdgeClass.FILLET)
