@@ -41,7 +41,7 @@ HOMOGENEITY = (7.0, 0.1, 0.25)
 SURFACE_NOISE = (1.3, 0.02)
 """A point deviates from its surface by this many standard deviations of the noise, plus so many
 spacings, for surfaces are fitted to noisy points."""
-EXACT_NOISE = (0.5, 0.005)
+EXACT_NOISE = (0.5, 0.002)
 """... but of the latter no more than so many standard deviations, plus so many spacings, which
 rounding leaves on perfect data."""
 TURNS = (0.25, 4.0)
@@ -128,6 +128,7 @@ def derive(params: Params, measured: Measurement) -> Params:
         surfaces = replace(surfaces, noise=times * noise + off)
     if surfaces.tilt is None:
         surfaces = replace(surfaces, tilt=max(LEAST_TILT, measured.normal_noise))
+    assert surfaces.tilt is not None and regions.min_points is not None
     exact = math.sqrt(one) / surfaces.noise if one > 0 and surfaces.noise else 1.0
     if surfaces.turn is None:
         times, deviations = TURNS

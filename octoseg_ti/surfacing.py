@@ -43,6 +43,9 @@ _SAMPLES, _REST = 4, 6
 _AROUND, _HARDLY = 12, 1e-3
 # The normals of narrow faces, and of points at edges, may be off so many times more than others.
 _NARROW = 2.0
+# ... where positions are so exact that a surface needs no more than this share of the points of a
+# patch: they tell by themselves.
+_ALONE = 0.5
 # A leaf takes part in a new group when so many of its points fit nothing, or one in so many.
 _LEFT_POINTS, _LEFT_SHARE = 2, 3
 # Samples for fitting a surface anew.
@@ -242,6 +245,8 @@ def find_surfaces(
     cut: np.ndarray,
     tolerance: Tolerance,
     rule: Rule,
+    *,
+    narrow: bool,
 ) -> Surfaced:
     """Find the analytic surfaces of a part, and the surface of every point.
 
@@ -253,6 +258,7 @@ def find_surfaces(
             a group is no sum of surfaces: each of its faces may still be one.
         tolerance: What counts as lying on a surface.
         rule: What a point may differ from the surface that it takes.
+        narrow: Positions are so exact that they tell narrow faces, whose normals do not.
     """
     search = _Search(grid, leaves, tolerance, rule)
     samples = search.samples
@@ -271,7 +277,7 @@ def find_surfaces(
             break
     else:
         search.choose(passes=2)
-    rest, sets = search.rest(around=True)
+    rest, sets = search.rest(around=True) if narrow else (rest, [])
     # Normals of narrow faces are those of the faces beside them.
     if sets and search.add(rest, sets, turn=_NARROW * tolerance.turn):
         search.choose(passes=2)
@@ -310,10 +316,13 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
     assert fewest is not None and least is not None
     graph = leaf_graph(grid, leaves.astype(np.int32), found.touching)
     rule = Rule(noise, tilt)
-    rule = rule._replace(turn=max(rule.turn, _NARROW * turn))
+    exact = fewest <= _ALONE * least
+    if exact:
+        rule = rule._replace(turn=max(rule.turn, _NARROW * turn))
     surfaced = find_surfaces(
-        grid, graph, found.group[leaves], found.cut[leaves], Tolerance(noise, turn, fewest), rule
-    )
+        grid, graph, found.group[leaves], found.cut[leaves],
+        Tolerance(noise, turn, fewest, exact), rule, narrow=exact,
+    )  # fmt: skip
     label, surface = number_pieces(graph, surfaced, least, fewest)
     # Regions of which surfaces explain less than half stay; they are free forms.
     rest = (label < 0) & (found.label >= 0)

@@ -105,7 +105,9 @@ def main() -> None:
     print(f"{'cloud':8s}{head}")
     for path in paths:
         half = ("even", "odd")[int(path.stem[2:]) % 2]
-        if options.half not in (half, "both") or (options.clouds and path.stem not in options.clouds):
+        if options.half not in (half, "both") or (
+            options.clouds and path.stem not in options.clouds
+        ):
             continue
         points, truth = read_cloud(path)
         began = time.perf_counter()

@@ -12,6 +12,7 @@ from octoseg_ti.types import EdgeClass, Segmentation, SurfaceKind
 from scanner_sim import StripeScanner, simulate
 from scanner_sim.part import Part, box, cylinder, half_space, intersection, union
 
+
 def bend(radius: float, turn_deg: float, *, fillet: bool, wide: float = 8.0) -> Part:
     """A ridge of two planes along x, rounded by a cylinder."""
     limits = box((-wide, -wide, -20), (wide, wide, 5))

@@ -66,7 +66,7 @@ def test_given_values_stay() -> None:
         registration=RegistrationParams(reach=2.5),
         grid=GridParams(tolerance=0.2, edge_tolerance=0.25, min_cell=3.0, divisions=7),
         regions=RegionParams(homogeneity=0.5, min_points=11),
-        surfaces=SurfaceParams(noise=0.1, tilt=0.2),
+        surfaces=SurfaceParams(noise=0.1, tilt=0.2, turn=0.4, min_points=20),
     )
     assert derive(given, CLEAN) == given
 

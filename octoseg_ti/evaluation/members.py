@@ -1,6 +1,6 @@
 """All points that lie on each patch: a point of a crease lies on several."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,7 +14,8 @@ _NEAREST, _SPACINGS = 24, 3.0
 _ON = 3.0
 
 
-class Members(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False)
+class Members:
     """The points on every one of ``K`` patches; a point may be on several."""
 
     start: np.ndarray

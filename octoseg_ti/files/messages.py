@@ -56,6 +56,7 @@ PARAMS_FIELDS = (
     ("edges_smallest_levels", "double"),
     ("edges_fillet_levels", "double"),
     ("edges_radius", "double"),
+    ("edges_fillet_radius", "double"),
     ("regions_homogeneity", "double"),
     ("regions_min_points", "double"),
     ("regions_assign_edges", "bool"),

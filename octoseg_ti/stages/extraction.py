@@ -42,8 +42,8 @@ _TOGETHER, _KEPT = 0.5, 0.8
 # more than so many noises, fewer the less they explain and the more of it neighbours share: pieces
 # of a free form are cut out as far as they just fit, and leave gaps and waves.
 _COVERED, _REAL = 0.6, 1.75
-# ... and at any rate when this share of them is nearer than so many noises: of noise that is half,
-# of what is cut out as far as it just fits a sixth.
+# ... and, where positions are exact, when this share of them is nearer than so many noises: of
+# noise that is half, of what is cut out as far as it just fits a sixth.
 _EXACT, _MOSTLY = 0.5, 0.75
 
 
@@ -56,6 +56,9 @@ class Tolerance(NamedTuple):
     """Largest angle between the normals of a sample and of its surface [rad]."""
     points: float
     """Fewest points of a surface."""
+    exact: bool = False
+    """Positions are exact, next to their spacing: a surface that they lie on is real, whatever lies
+    beside it."""
 
 
 def explain(
@@ -254,11 +257,16 @@ def _take_apart(
             going = [w for w in taken if not w.ended(tolerance.points)]
             gained |= taken
         active = [w for w in gained if w.seeds > 0 and not w.ended(tolerance.points)]
-    return _real_ones(samples, sets, found, label, tolerance.noise)
+    return _real_ones(samples, sets, found, label, tolerance.noise, tolerance.exact)
 
 
 def _real_ones(
-    samples: Samples, sets: list[np.ndarray], found: Surfaces, label: np.ndarray, noise: float
+    samples: Samples,
+    sets: list[np.ndarray],
+    found: Surfaces,
+    label: np.ndarray,
+    noise: float,
+    exact: bool,
 ) -> tuple[Surfaces, np.ndarray]:
     """Drop the surfaces of sets that are free forms."""
     real = np.zeros(len(found) + 1, bool)
@@ -275,6 +283,8 @@ def _real_ones(
         product, square = far[1:][pair] * far[:-1][pair], far[1:][pair] ** 2
         shared = max(0.0, float(product.sum()) / max(float(square.sum()), 1e-300))
         real[name] = covered >= _COVERED and (1.0 + shared) * rms <= covered * _REAL * noise
+        if not exact:
+            continue
         near = np.bincount(name, weight * (np.abs(far) <= _EXACT * noise), len(found))
         real[:-1] |= near > _MOSTLY * np.maximum(np.bincount(name, weight, len(found)), 1e-300)
     kept = np.flatnonzero(real[:-1])

@@ -124,9 +124,8 @@ def _choose(
                 off = ti.abs(d) / rule[0]
                 least = off * off + surface_in[s, 9]
                 if least < after[0] or (off <= rule[2] and least < best[0]):
-                    angle = ti.acos(ti.min(1.0, ti.abs(n.dot(m))))
-                    if m.norm_sqr() == 0.0:
-                        angle = 0.0
+                    facing = ti.select(m.norm_sqr() > 0.0, ti.abs(n.dot(m)), 1.0)
+                    angle = ti.acos(ti.min(1.0, facing))
                     turn = angle / rule[1]
                     # Beyond six deviations hardly more: of two surfaces through a point of an edge
                     # the one that it faces a little.

@@ -46,9 +46,7 @@ def surface_noise(grid: Grid, leaves: np.ndarray, group: np.ndarray) -> float | 
     if len(inside) == 0:
         return None
     # Whole boxes: which points of a box come first would depend on the order of the input.
-    starts = np.unique(
-        np.searchsorted(key, key[inside[np.arange(_COUNT) * len(inside) // _COUNT]])
-    )
+    starts = np.unique(np.searchsorted(key, key[inside[np.arange(_COUNT) * len(inside) // _COUNT]]))
     ends = np.searchsorted(key, key[np.minimum(starts + _WINDOW * _POINTS, len(key) - 1)])
     found: dict[tuple[int, int], np.ndarray] = {}
     for first, last in zip(starts, ends, strict=True):

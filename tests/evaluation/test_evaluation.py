@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from octoseg_ti import DataError, EdgeClass, Truth, evaluate
 from octoseg_ti.evaluation import adjusted_rand, best_match, overlap_table, wrong_points
+from octoseg_ti.types import Fillets
 
 
 def blocks(*sizes):
@@ -433,3 +434,24 @@ def test_evaluation_needs_no_taichi():
     code = "import sys, octoseg_ti; octoseg_ti.evaluate([0], [0]); print('taichi' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_radii_of_fillets() -> None:
+    """Of three fillets one is off by a tenth, and one lies on no true fillet."""
+    point = np.repeat([0, 1, 2, -1], [60, 30, 10, 20]).astype(np.int32)
+    radius = np.where(point == 2, np.nan, 2.0).astype(np.float32)
+    truth = Truth(patch=np.zeros(120, np.int32), radius=radius)
+    three = np.zeros(3)
+    found = Fillets(
+        patches=np.zeros((3, 2), np.int32), radius=np.array([2.02, 1.8, 5.0]), deviation=three,
+        concave=three.astype(np.uint8), points=np.array([60, 30, 10], np.int32),
+        strip=np.full(1, -1, np.int32), point=point,
+    )  # fmt: skip
+    scores = evaluate(SimpleNamespace(labels=truth.patch, fillets=found), truth)
+    got = scores.fillets
+    assert got is not None and (got.found, got.right) == (3, 2)
+    np.testing.assert_allclose(
+        [got.median, got.worst, got.within_5, got.within_10], [0.055, 0.1, 2 / 3, 1.0]
+    )
+    assert "fillets: 3 found, 2 right" in str(scores)
+    assert evaluate(SimpleNamespace(labels=truth.patch, fillets=found), truth.patch).fillets is None

@@ -15,6 +15,7 @@ from reference.rays import first_hit
 from octoseg_ti.errors import DataError
 from octoseg_ti.types import EdgeClass, Scans, SurfaceKind, Truth
 from scanner_sim import StripeScanner, View, blocks, simulate
+from scanner_sim.features import FILLET_LIMIT
 from scanner_sim.part import Part, box, difference, rod, sphere, union
 from scanner_sim.quadric import distance, gradient
 from scanner_sim.raycast import classify
@@ -151,6 +152,9 @@ def test_fillets_are_edges_and_no_patches(scanned: tuple[str, Part, Scans, Truth
     assert (truth.patch[fillet] == -1).all()
     assert (truth.edge_distance[fillet] == 0).all()
     assert (truth.edge_class[fillet] == EdgeClass.FILLET).all()
+    assert truth.radius is not None
+    assert np.array_equal(np.isfinite(truth.radius), fillet)
+    assert np.all(truth.radius[fillet] <= FILLET_LIMIT)
     assert set(truth.kind[fillet]) <= {SurfaceKind.CYLINDER, SurfaceKind.TORUS}
 
 

@@ -1,0 +1,219 @@
+"""Fillets: balls that explain the points around an edge which neither side explains.
+
+A ball that rolls along both sides of an edge is fitted to the points around it; its radius is the
+only unknown. Balls that gain on the sharp edge are fillets, the best supported first: each claims
+the points on it, and what is left has to support the next.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from octoseg_ti.stages.leaves import Samples
+from octoseg_ti.stages.marking import nearest_marked
+from octoseg_ti.stages.profiles import BALL, NOWHERE
+from octoseg_ti.stages.sets import fit_sets, spread
+from octoseg_ti.types import NONE
+from octoseg_ti.zones import CAP, Search, Zones, listed, points_of, thinned
+
+ON = 3.5
+"""A point lies on a ball within so many noises."""
+
+# Points of the zone of an edge that are looked at, that the radius is fitted to, and that radii are
+# tried on; each of these is larger than the last by the ratio.
+_MANY, _SOME, _FEW = 3000, 600, 150
+_RATIO = 1.15
+_HOPE = 0.03  # share of the points that a radius has to explain beyond a sharp edge, to go on
+_NEWTON = 6
+_TURN = 0.5  # ... and its normal is that of the ball within this angle [rad]
+# A fillet gains at least this much over a sharp edge, in squares of the noise: in all, and for each
+# point on it.
+_GAIN, _EACH = 40.0, 0.25
+_ARC = 1.5  # a fillet is at least this wide [spacings]
+_SLACK = 1.05  # its radius may be above the limit by so much: that it is not known exactly
+_FEWEST = 8
+_SHARED = 2.0  # neighbours share some of their noise, and the sides are not known exactly
+# Its points are no farther from the ball than from the surfaces of their patches, times this, plus
+# so many noises.
+_WORSE, _EVEN = 1.2, 0.3
+_FRESH = 0.5  # ... and this share of its points is on no better one
+_WEAK = 2.0  # a point so many noises from the surface of its patch lies on that
+_STRIP_SHARE = 0.5  # a patch is the strip of a fillet when so much of it is claimed
+_REFIT = 300
+
+
+class Fit(NamedTuple):
+    """The balls of all pairs."""
+
+    radius: np.ndarray
+    """Radius [mm], above 0 = concave, shape (P,)."""
+    deviation: np.ndarray
+    """Its standard deviation [mm]."""
+    hollow: np.ndarray
+    """1 where the edge is concave, -1 where it is convex."""
+    turn: np.ndarray
+    """Mean angle by which the surface turns over the edge [rad]."""
+    points: np.ndarray
+    """Points of the zone near the edge."""
+    good: np.ndarray
+    """Whether the ball may be a fillet."""
+    quality: np.ndarray
+    """Weight of its support, 0.1..1."""
+
+
+def fit_balls(search: Search, zones: Zones) -> Fit:
+    """Fit a ball to the points around the edge of every pair."""
+    pairs, noise = len(zones.pairs), search.noise
+    point, pair = points_of(search, zones, np.ones(pairs, bool))
+    whole = np.bincount(pair, minlength=pairs)
+    kept = thinned(pair, pairs, _MANY)
+    point, pair = point[kept], pair[kept]
+    share = np.bincount(pair, minlength=pairs) / np.maximum(whole, 1)
+    at = search.place(zones.pairs, np.zeros(pairs), point, pair)
+    kept = (at.region != NOWHERE) & (at.along <= search.reach(at.turn))
+    point, pair = point[kept], pair[kept]
+    total = np.bincount(pair, minlength=pairs)
+    turn = np.bincount(pair, at.turn[kept], pairs) / np.maximum(total, 1)
+    every = total / np.maximum(share, 1e-9)
+    height = np.bincount(pair, np.sign(at.height[kept]), pairs)
+    hollow = np.where(height < 0.0, -1.0, 1.0)
+    kept = thinned(pair, pairs, _SOME)
+    point, pair = point[kept], pair[kept]
+    kept = thinned(pair, pairs, _FEW)
+    total = np.bincount(pair[kept], minlength=pairs)
+    ends = np.cumsum(total)
+    radii = np.concatenate([[0.0], search.radii(_RATIO)])
+    task = np.column_stack([zones.pairs, ends - total, ends])
+    cost, _ = search.tried(task, radii, hollow, point[kept])
+    best = cost.argmin(axis=1)
+    gain = (cost[:, 0] - cost.min(axis=1)) * (search.coarse() / noise) ** 2
+    hope = gain > np.maximum(_HOPE * total, 1.0)
+    radius = np.maximum(radii[best], 0.5 * search.spacing)
+    total = np.bincount(pair, minlength=pairs)
+    ends = np.cumsum(total)
+    task = np.column_stack([zones.pairs, ends - total, ends])[hope]
+    now, none = np.zeros((pairs, 4)), np.zeros((pairs, 4))
+    shape = np.column_stack([radius, hollow])[hope]
+    cap = CAP * noise
+    none[hope] = search.sums(task, shape * [0.0, 1.0], point, cap)
+    for turn_ in range(_NEWTON):
+        now[hope] = search.sums(task, shape, point, cap)
+        if turn_ + 1 < _NEWTON:
+            step = -now[hope, 1] / np.maximum(now[hope, 2], 1e-12)
+            least = 0.2 * shape[:, 0]
+            shape[:, 0] += np.clip(step, -least, least)
+            shape[:, 0] = np.clip(shape[:, 0], 0.02, 2.0 * search.limit)
+    radius[hope] = shape[:, 0]
+    gain = (none[:, 0] - now[:, 0]) / noise**2
+    rms = np.sqrt(now[:, 0] / np.maximum(total, 1))
+    good = hope & (
+        (gain * every >= _GAIN * np.maximum(total, 1))
+        & (gain >= _EACH * now[:, 3])
+        & (radius * turn >= _ARC * search.spacing)
+        & (radius <= _SLACK * search.limit)
+        & (now[:, 3] >= _FEWEST)
+    )
+    return Fit(
+        radius=radius * hollow,
+        deviation=_SHARED * np.maximum(rms, 0.3 * noise) / np.sqrt(np.maximum(now[:, 2], 1e-12)),
+        hollow=hollow,
+        turn=turn,
+        points=total,
+        good=good,
+        quality=np.clip(1.5 - rms / (2.0 * noise), 0.1, 1.0),
+    )
+
+
+def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
+    """Let balls claim the points on them, the best supported first; say which remain, (P,) bool."""
+    point, pair = points_of(search, zones, fit.good)
+    at = search.place(zones.pairs, fit.radius, point, pair)
+    on = (at.region == BALL) & (np.abs(at.off) <= ON * search.noise)
+    on &= at.cosine >= np.cos(_TURN)
+    point, pair = point[on], pair[on]
+    # What the surface of a patch explains better is no fillet: a chamfer, the next fillet.
+    _, of = np.unique(
+        pair.astype(np.int64) * (search.count + 1) + search.label[point], return_inverse=True
+    )
+    number = np.bincount(of)
+    ball, own = np.bincount(of, at.off[on] ** 2), np.bincount(of, search.off[point] ** 2)
+    better = ball <= _WORSE**2 * own + (_EVEN * search.noise) ** 2 * number
+    side = (search.label[point][:, None] == zones.pairs[pair]).any(axis=1)
+    kept = better[of] | side
+    others = np.bincount(pair, ~side, len(zones.pairs))
+    agree = 2.0 * np.bincount(pair, kept & ~side, len(zones.pairs)) >= others
+    point, pair = point[kept], pair[kept]
+    ends = np.searchsorted(pair, np.arange(len(zones.pairs) + 1))
+    support = np.diff(ends)
+    search.claim[:] = NONE
+    chosen = np.zeros(len(zones.pairs), bool)
+    for p in np.argsort(-support * fit.quality, kind="stable"):
+        if support[p] < _FEWEST or not agree[p]:
+            continue
+        mine = point[ends[p] : ends[p + 1]]
+        fresh = mine[search.claim[mine] < 0]
+        if len(fresh) < max(_FRESH * len(mine), _FEWEST):
+            continue
+        search.claim[fresh] = p
+        chosen[p] = True
+    drop_weak_claims(search, zones, fit)
+    return chosen
+
+
+def drop_weak_claims(search: Search, zones: Zones, fit: Fit) -> None:
+    """Give back points that lie on a side of the fillet as well, unless others are next to them.
+
+    Near the line of contact the ball is as good as the surface; beyond the end of a fillet both go
+    on, and there nothing else lies on the ball.
+    """
+    mine = np.flatnonzero(search.claim >= 0)
+    pair = search.claim[mine]
+    side = (search.label[mine][:, None] == zones.pairs[pair]).any(axis=1)
+    weak = side & (search.off[mine] <= _WEAK * search.noise)
+    mark = search.claim.copy()
+    mark[mine[weak]] = NONE
+    mine, pair = mine[weak], pair[weak]
+    leaf = np.searchsorted(search.leaves.first, mine, side="right") - 1
+    reach = np.sqrt(2.0 * ON * search.noise * np.abs(fit.radius[pair])) + search.spacing
+    far = nearest_marked(search.device[0], mark, search.leaves, search.box, mine, leaf, pair, reach)
+    search.claim[mine[~np.isfinite(far)]] = NONE
+
+
+def refit_sides(search: Search) -> None:
+    """Fit the surfaces of patches anew without the points that fillets claim."""
+    claimed = np.bincount(
+        search.label[(search.claim >= 0) & (search.label >= 0)], minlength=search.count
+    )
+    left = search.size - claimed
+    again = np.flatnonzero(
+        search.analytic
+        & (claimed > 0.01 * search.size)
+        & (left >= 0.5 * search.size)
+        & (left >= 50)
+    )
+    if len(again) == 0:
+        return
+    sets = [spread(search.members[k][search.claim[search.members[k]] < 0], _REFIT) for k in again]
+    index, owner = listed(sets)
+    samples = Samples(
+        index=index.astype(np.int32), leaf=owner.astype(np.int32), point=search.points[index],
+        normal=search.normals[index], weight=np.ones(len(index)),
+    )  # fmt: skip
+    ends = np.cumsum([len(s) for s in sets])
+    order = np.split(np.arange(len(index)), ends[:-1])
+    fitted, surfaces = fit_sets(samples, order, search.noise, robust=True)
+    k = again[fitted]
+    search.table[k, :8], search.table[k, 8] = surfaces.parameters, surfaces.kind
+    search.set_sides()
+
+
+def strips_of(search: Search, number: np.ndarray) -> np.ndarray:
+    """Return the fillet that every patch is a strip of, -1 = none, shape (K,), i32."""
+    there = (search.claim >= 0) & (search.label >= 0)
+    fillets = int(number.max(initial=NONE)) + 1
+    key = search.label[there].astype(np.int64) * max(fillets, 1) + number[search.claim[there]]
+    table = np.bincount(key, minlength=search.count * max(fillets, 1)).reshape(search.count, -1)
+    most = table.sum(axis=1) >= np.maximum(_STRIP_SHARE * search.size, 1)
+    return np.where(most, table.argmax(axis=1), NONE).astype(np.int32)

@@ -1,0 +1,290 @@
+"""Where two patches may share an edge: in contact, or with a strip between them.
+
+A strip is a patch whose points lie on a ball that touches two of its neighbours. The zone of an
+edge is the leaves where both patches are near, and those of its strips.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.device.surfaces import evaluate_surfaces
+from octoseg_ti.stages.extraction import Surfaces
+from octoseg_ti.stages.labelling import label_lists, near_lists
+from octoseg_ti.stages.leaves import Leaves
+from octoseg_ti.stages.profiles import NOWHERE, Places, place, sums
+from octoseg_ti.stages.sets import spread
+from octoseg_ti.types import NONE
+
+CAP = 4.0
+"""Distances beyond this many noises count as this many."""
+EDGE = 2.0
+"""Edge points are this near an edge [spacings]."""
+
+# Samples of a patch that tell its side, and of a strip that tell what it lies between.
+_SIDE, _STRIP = 200, 60
+# A strip lies between two surfaces when this share of its samples does.
+_BETWEEN = 0.3
+# Radii that are tried: from the least [spacings] up to so many limits.
+_LEAST, _MOST = 1.0, 1.35
+_RATIO = 1.3  # each larger by this ratio: a strip is only to be recognised
+_COARSE = 0.4  # while radii are tried, distances beyond so many spacings count as this many
+
+
+class Zones(NamedTuple):
+    """Pairs of patches that may share an edge, and the leaves around it."""
+
+    pairs: np.ndarray
+    """The patches, the smaller number first, shape (P, 2)."""
+    pair: np.ndarray
+    """Pair of every entry, ascending, shape (E,)."""
+    leaf: np.ndarray
+    """Leaf of every entry, shape (E,)."""
+    fine: np.ndarray
+    """Whether the leaf is small, shape (E,), bool: the others are next to the edge, or far off."""
+    labels: np.ndarray
+    """Pair and label of points that may lie on the edge, as one number, ascending."""
+    width: int
+    """Labels are below this."""
+
+    def allows(self, pair: np.ndarray, label: np.ndarray) -> np.ndarray:
+        """Say which points may lie on an edge: those of its sides, its strips, of no patch."""
+        key = pair.astype(np.int64) * self.width + label
+        hit = np.minimum(np.searchsorted(self.labels, key), max(len(self.labels) - 1, 0))
+        return (label < 0) | (self.labels[hit] == key)
+
+
+class Search:
+    """What the steps of the search for borders share."""
+
+    def __init__(
+        self,
+        points: Any,
+        normals: Any,
+        leaves: Leaves,
+        label: np.ndarray,
+        surface: np.ndarray,
+        surfaces: Surfaces,
+        noise: float,
+        spacing: float,
+        limit: float,
+    ) -> None:
+        self.device = points, normals
+        self.points, self.normals = runtime.download(points), runtime.download(normals)
+        self.leaves, self.label = leaves, label
+        self.noise, self.spacing, self.limit = noise, spacing, limit
+        self.count = len(surface)
+        self.analytic = surface >= 0
+        order = np.argsort(label, kind="stable")
+        ends = np.searchsorted(label[order], np.arange(self.count + 1))
+        self.members = [order[lo:hi] for lo, hi in pairwise(ends)]
+        self.size = np.diff(ends)
+        which = np.maximum(surface, 0)
+        self.table = np.zeros((self.count, 10))
+        if len(surfaces):
+            self.table[:, :8], self.table[:, 8] = surfaces.parameters[which], surfaces.kind[which]
+        self.table[~self.analytic] = 0.0
+        self.set_sides()
+        # Distance of every point from the surface of its patch [mm], capped.
+        self.off = np.full(len(label), CAP * noise)
+        there = np.flatnonzero((label >= 0) & self.analytic[np.maximum(label, 0)])
+        far, _ = evaluate_surfaces(
+            self.points[there], label[there], self.table[:, 8].astype(np.int32), self.table[:, :8]
+        )
+        self.off[there] = np.minimum(np.abs(far), CAP * noise)
+        self.own = label_lists(leaves, label)
+        self.near = near_lists(leaves, self.own)
+        self.claim = np.full(len(label), NONE, np.int32)
+        self.box = np.concatenate(
+            [
+                np.minimum.reduceat(self.points, leaves.first),
+                np.maximum.reduceat(self.points, leaves.first),
+            ],
+            axis=1,
+        )
+
+    def set_sides(self) -> None:
+        """Say for every surface on which side the air is."""
+        index, owner = listed([spread(m, _SIDE) for m in self.members])
+        _, outward = evaluate_surfaces(
+            self.points[index], owner, self.table[:, 8].astype(np.int32), self.table[:, :8]
+        )
+        cosine = np.nan_to_num(np.einsum("ij,ij->i", outward, self.normals[index]))
+        self.table[:, 9] = np.where(np.bincount(owner, cosine, self.count) < 0.0, -1.0, 1.0)
+
+    def place(
+        self, pairs: np.ndarray, radius: np.ndarray, point: np.ndarray, pair: np.ndarray
+    ) -> Places:
+        """Place points on profiles."""
+        return place(*self.device, self.table, pairs, radius, point, pair)
+
+    def near_edge(
+        self,
+        pairs: np.ndarray,
+        radius: np.ndarray,
+        points: np.ndarray,
+        point: np.ndarray,
+        pair: np.ndarray,
+        reach: np.ndarray,
+    ) -> np.ndarray:
+        """Say which of other points are within reach of edges."""
+        device = runtime.upload(points)
+        return place(device, device, self.table, pairs, radius, point, pair).along <= reach
+
+    def sums(
+        self, task: np.ndarray, shape: np.ndarray, entry: np.ndarray, cap: float
+    ) -> np.ndarray:
+        """Sum up how profiles fit."""
+        return sums(self.device[0], self.table, task, shape, entry, cap)
+
+    def reach(self, turn: np.ndarray) -> np.ndarray:
+        """Return how far from the sharp edge a fillet can reach [mm]."""
+        wide = np.minimum(np.tan(turn / 2.0), 3.0)
+        return _MOST * self.limit * wide + EDGE * self.spacing
+
+    def absorbed(self) -> float:
+        """Return how wide a piece of a fillet may pass as a part of the surface beside it [mm]."""
+        return float(np.sqrt(2.0 * CAP * self.noise * self.limit)) + 1.5 * self.spacing
+
+    def radii(self, ratio: float) -> np.ndarray:
+        """Return the radii that are tried, each larger than the last by this ratio."""
+        least = _LEAST * self.spacing
+        steps = int(np.ceil(np.log(max(_MOST * self.limit / least, 1.1)) / np.log(ratio))) + 1
+        return least * ratio ** np.arange(steps)
+
+    def coarse(self) -> float:
+        """Return the distance beyond which points count alike while radii are tried [mm]."""
+        return max(CAP * self.noise, _COARSE * self.spacing)
+
+    def tried(
+        self, task: np.ndarray, radii: np.ndarray, hollow: np.ndarray, point: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the cost of every radius for every task, and the points on its ball."""
+        cap = self.coarse()
+        shape = np.column_stack([np.tile(radii, len(task)), np.repeat(hollow, len(radii))])
+        got = self.sums(np.repeat(task, len(radii), axis=0), shape, point, cap)
+        got = got.reshape(len(task), len(radii), 4)
+        return got[..., 0] / cap**2, got[..., 3]
+
+
+def listed(sets: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the members of all sets, and the set of each."""
+    owner = np.repeat(np.arange(len(sets)), [len(s) for s in sets])
+    return (np.concatenate(sets) if sets else np.zeros(0, np.int64)), owner
+
+
+def ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Return the numbers from every first on, so many each, one range after the other."""
+    ends = np.cumsum(count, dtype=np.int64)
+    total = int(ends[-1]) if len(ends) else 0
+    return np.arange(total) + np.repeat(first - (ends - count), count)
+
+
+def thinned(owner: np.ndarray, pairs: int, most: int) -> np.ndarray:
+    """Return which entries to keep so that every pair keeps at most about so many, evenly."""
+    total = np.bincount(owner, minlength=pairs)
+    rank = np.arange(len(owner)) - (np.cumsum(total) - total)[owner]
+    return rank % np.maximum(-(-total // most), 1)[owner] == 0
+
+
+def pairs_near(near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return all pairs of labels that are near the same leaf, smaller first, and these leaves."""
+    found, leaf = [np.zeros((0, 2), np.int64)], [np.zeros(0, np.int64)]
+    there = np.arange(len(near))
+    for j in range(1, near.shape[1]):
+        there = there[near[there, j] >= 0]
+        for i in range(j if len(there) else 0):
+            found.append(near[there][:, [i, j]])
+            leaf.append(there)
+    return np.concatenate(found), np.concatenate(leaf)
+
+
+def strips_between(search: Search, touching: np.ndarray) -> np.ndarray:
+    """Return patches that lie on a ball between two of the patches they touch, shape (S, 3).
+
+    Args:
+        search: What is known.
+        touching: Pairs of patches that touch, each once.
+    """
+    both = np.concatenate([touching, touching[:, ::-1]])
+    both = both[search.analytic[both[:, 1]]]
+    sets = [np.sort(both[both[:, 0] == s, 1]) for s in range(search.count)]
+    triples = [np.zeros((0, 3), np.int64)]
+    for s, sides in enumerate(sets):
+        i, j = np.triu_indices(len(sides), 1)
+        triples.append(np.column_stack([np.full(len(i), s), sides[i], sides[j]]))
+    triple = np.concatenate(triples)
+    samples = [spread(m, _STRIP) for m in search.members]
+    size = np.array([len(s) for s in samples])
+
+    def listed_for(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return listed([samples[s] for s in rows[:, 0]])
+
+    if len(triple) == 0:
+        return triple
+    entry, owner = listed_for(triple)
+    at = search.place(triple[:, 1:], np.zeros(len(triple)), entry, owner)
+    inside = (at.region != NOWHERE) & (at.along <= search.reach(at.turn))
+    height = np.bincount(owner, inside * np.sign(at.height), len(triple))
+    kept = np.bincount(owner, inside, len(triple)) >= _BETWEEN * size[triple[:, 0]]
+    triple, hollow = triple[kept], np.where(height[kept] < 0.0, -1.0, 1.0)
+    if len(triple) == 0:
+        return triple
+    entry, _ = listed_for(triple)
+    ends = np.cumsum(size[triple[:, 0]])
+    task = np.column_stack([triple[:, 1:], ends - size[triple[:, 0]], ends])
+    cost, on = search.tried(task, search.radii(_RATIO), hollow, entry)
+    best = (on - cost).argmax(axis=1)
+    return triple[on[np.arange(len(triple)), best] >= _BETWEEN * size[triple[:, 0]]]
+
+
+def find_zones(search: Search) -> Zones:
+    """Return the pairs of patches that may share an edge, and where."""
+    pairs, leaf = pairs_near(search.near)
+    width, cells = search.count + 1, len(search.leaves)
+    touching = np.unique(pairs[:, 0].astype(np.int64) * width + pairs[:, 1])
+    triple = strips_between(search, np.column_stack([touching // width, touching % width]))
+    cell, rank = np.nonzero(search.own >= 0)
+    name = search.own[cell, rank]
+    order = np.argsort(name, kind="stable")
+    cell, first = cell[order], np.searchsorted(name[order], np.arange(search.count + 1))
+    each = (first[1:] - first[:-1])[triple[:, 0]]
+    along = cell[ranges(first[triple[:, 0]], each)]
+    # Large leaves are far inside a patch: their points say nothing about its edges.
+    size = search.leaves.size
+    small = size <= max(2.0 * size.min(), search.absorbed())
+    real = search.analytic[pairs].all(axis=1)
+    key = np.concatenate(
+        [
+            (pairs[real, 0].astype(np.int64) * width + pairs[real, 1]) * cells + leaf[real],
+            np.repeat(triple[:, 1] * width + triple[:, 2], each) * cells + along,
+        ]
+    )
+    key = np.unique(key)
+    code, which = np.unique(key // cells, return_inverse=True)
+    pairs = np.column_stack([code // width, code % width])
+    fine = small[key % cells]
+    fine |= (np.bincount(which, fine, len(code)) == 0)[which]
+    number = np.arange(len(code))
+    between = np.searchsorted(code, triple[:, 1] * width + triple[:, 2])
+    labels = np.unique(
+        np.concatenate(
+            [number * width + pairs[:, 0], number * width + pairs[:, 1],
+             between * width + triple[:, 0]]
+        )
+    )  # fmt: skip
+    return Zones(pairs, which, key % cells, fine, labels, width)
+
+
+def points_of(search: Search, zones: Zones, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points that may lie on the edges of some pairs, and the pair of each."""
+    kept = which[zones.pair] & zones.fine
+    leaf, pair = zones.leaf[kept], zones.pair[kept]
+    count = search.leaves.count[leaf]
+    point, pair = ranges(search.leaves.first[leaf], count), np.repeat(pair, count)
+    kept = zones.allows(pair, search.label[point])
+    return point[kept], pair[kept]
