@@ -14,7 +14,7 @@ from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F32Rows, F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.surfaces import surface_at
 from octoseg_ti.stages.grid import Grid
-from octoseg_ti.stages.leaves import Leaves
+from octoseg_ti.stages.leaves import Leaves, distinct
 from octoseg_ti.types import NONE
 
 MOST = 12
@@ -163,7 +163,7 @@ def own_lists(leaves: Leaves, leaf: np.ndarray, label: np.ndarray) -> np.ndarray
     own = np.full((len(leaves), MOST), NONE, np.int32)
     there = label >= 0
     width = int(label.max(initial=0)) + 1
-    key = np.unique(leaf[there].astype(np.int64) * width + label[there])
+    key = distinct(leaf[there].astype(np.int64) * width + label[there])
     cell, name = key // width, key % width
     new = np.ones(len(cell), bool)
     new[1:] = cell[1:] != cell[:-1]

@@ -6,7 +6,7 @@ import numpy as np
 
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
-from octoseg_ti.stages.leaves import Leaves, Samples
+from octoseg_ti.stages.leaves import Leaves, Samples, distinct
 from octoseg_ti.stages.sets import Surfaces, fit_sets, spread
 from octoseg_ti.types import NONE
 
@@ -65,7 +65,7 @@ def smooth_contacts(
     _, n = evaluate_surfaces(point, one, surfaces.kind, surfaces.parameters)
     _, m = evaluate_surfaces(point, other, surfaces.kind, surfaces.parameters)
     smooth = np.abs(np.einsum("ij,ij->i", n, m)) >= np.cos(_EDGE)
-    return _pairs_of(np.unique(_keys(one, other, own)[smooth]), own)
+    return _pairs_of(distinct(_keys(one, other, own)[smooth]), own)
 
 
 def _touches(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -73,8 +73,9 @@ def _touches(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     held = (own >= 0).sum(axis=1)
     cells = np.arange(len(own), dtype=np.int32)
     a, b = np.concatenate([leaves.a, cells]), np.concatenate([leaves.b, cells])
-    alike = (held[a] == 1) & (held[b] == 1) & (own[a, 0] == own[b, 0])
-    some = ~alike & (held[a] > 0) & (held[b] > 0)
+    only = _only(own)
+    some = (only[a] < 0) | (only[a] != only[b])
+    some[some] = (held[a[some]] > 0) & (held[b[some]] > 0)
     a, b = a[some], b[some]
     each = held[a] * held[b]
     at = np.repeat(np.arange(len(a)), each)
@@ -82,6 +83,11 @@ def _touches(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     one, other = own[a[at], rank // held[b[at]]], own[b[at], rank % held[b[at]]]
     differ = one != other
     return one[differ], other[differ], a[at[differ]]
+
+
+def _only(own: np.ndarray) -> np.ndarray:
+    """Return the surface of leaves that have one, -1 of others, shape (C,)."""
+    return np.where(own[:, 1] < 0, own[:, 0], NONE)
 
 
 def _keys(one: np.ndarray, other: np.ndarray, own: np.ndarray) -> np.ndarray:
@@ -286,18 +292,19 @@ def pieces(leaves: Leaves, own: np.ndarray, count: int) -> np.ndarray:
     number = np.full(own.size, NONE, np.int64)
     number[entry] = np.arange(len(entry))
     table = number.reshape(own.shape)
-    ends_a, ends_b = [], []
+    only = _only(own)
+    alike = (only[leaves.a] >= 0) & (only[leaves.a] == only[leaves.b])
+    ends_a, ends_b = [table[leaves.a[alike], 0]], [table[leaves.b[alike], 0]]
+    left_a, left_b = leaves.a[~alike], leaves.b[~alike]
     for k in range(most):  # where the two leaves of a pair share a surface
-        there = own[leaves.a, k] >= 0
+        there = own[left_a, k] >= 0
         if not there.any():
             break
-        a, b = leaves.a[there], leaves.b[there]
+        a, b = left_a[there], left_b[there]
         same = own[b] == own[a, k][:, None]
         hit = same.any(axis=1)
         ends_a.append(table[a[hit], k])
         ends_b.append(table[b[hit], same[hit].argmax(axis=1)])
-    if not ends_a:
-        return np.full(own.shape, NONE, np.int32)
     root = components(
         len(entry), np.concatenate(ends_a).astype(np.int32), np.concatenate(ends_b).astype(np.int32)
     )
