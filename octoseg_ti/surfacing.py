@@ -114,6 +114,8 @@ class _Search:
     ) -> bool:
         """Explain sets of samples; say whether that gave any new surface."""
         tolerance = self.tolerance if turn is None else self.tolerance._replace(turn=turn)
+        # A line has no normals, and is no surface.
+        sets = [s for s in sets if 2 * np.count_nonzero(samples.normal[s].any(axis=1)) > len(s)]
         new, label = explain(samples, self.leaves, sets, tolerance, apart=apart)
         for members in sets:
             large = samples.weight[members].sum() >= _FREE * self.tolerance.points

@@ -59,7 +59,7 @@ def build_truth(
         normal=normal,
         edge_distance=edge_distance.astype(np.float32),
         edge_class=edge_class,
-        radius=_radii(part)[surface],
+        radius=_radii(part)[surface] if part.surfaces.fillet.any() else None,
         info=info,
     )
 
