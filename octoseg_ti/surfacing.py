@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from octoseg_ti.device import runtime
+from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.params import Params
 from octoseg_ti.patches import Regions
@@ -25,8 +26,9 @@ from octoseg_ti.stages.labelling import (
     own_lists,
     surface_table,
 )
-from octoseg_ti.stages.leaves import Leaves, Samples, leaf_graph, sample_leaves
+from octoseg_ti.stages.leaves import Leaves, Samples, leaf_graph, sample_leaves, without_gaps
 from octoseg_ti.stages.merging import (
+    cut_out,
     explained_by_others,
     members_of,
     merge_surfaces,
@@ -59,6 +61,8 @@ _MERGES = 3
 _HANDICAP = 2.0
 # A free form has at least this many times the points of the smallest patch.
 _FREE = 10.0
+# Points of one piece of a surface are linked over so many times the longest distance of neighbours.
+_GAPS = 2.0
 # A point that fits nothing joins a patch within so many times the usual reach.
 _LOOSE = 3.0
 
@@ -239,6 +243,21 @@ class _Search:
         self.choose()
         return True
 
+    def give_up_slivers(self) -> None:
+        """Give up small surfaces that were cut out of the ragged rim of something else."""
+        label = self.label
+        size = np.bincount(label[label >= 0], minlength=len(self.surfaces))
+        small = (size > 0) & (size < _FREE * self.tolerance.points)
+        here = np.flatnonzero((label >= 0) & small[label])
+        if len(here) == 0:
+            return
+        point, name = runtime.download(self.grid.point)[here], label[here]
+        far, _ = evaluate_surfaces(point, name, self.surfaces.kind, self.surfaces.parameters)
+        gone = cut_out(name, far / self.tolerance.noise, len(size))
+        if gone.any():
+            self.rename(np.where(gone, NONE, np.arange(len(gone))))
+            self.choose()
+
 
 def find_surfaces(
     grid: Grid,
@@ -291,6 +310,7 @@ def find_surfaces(
             break
     search.early = len(search.surfaces)
     search.choose()
+    search.give_up_slivers()
     return Surfaced(surfaces=search.surfaces, label=search.label, own=search.own)
 
 
@@ -325,7 +345,9 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         grid, graph, found.group[leaves], found.cut[leaves],
         Tolerance(noise, turn, fewest, exact), rule, narrow=exact,
     )  # fmt: skip
-    label, surface = number_pieces(graph, surfaced, least, fewest)
+    gap = params.normals.gap
+    near = graph if gap is None else without_gaps(grid, graph, _GAPS * gap)
+    label, surface = number_pieces(near, surfaced, least, fewest)
     # Regions of which surfaces explain less than half stay; they are free forms.
     rest = (label < 0) & (found.label >= 0)
     size = np.bincount(found.label[found.label >= 0], minlength=found.count)

@@ -134,18 +134,55 @@ def leaf_graph(grid: Grid, node: np.ndarray, touching: Adjacency) -> Leaves:
     held = np.arange(neighbor.shape[1], dtype=np.int32) < count[:, None]
     a = place[np.repeat(np.arange(grid.count), count)]
     b = place[neighbor[held]]
+    return _linked(node, grid.first[node], grid.holds[node], grid.edge_length[node], a, b)
+
+
+def _linked(
+    node: np.ndarray,
+    first: np.ndarray,
+    count: np.ndarray,
+    size: np.ndarray,
+    a: np.ndarray,
+    b: np.ndarray,
+) -> Leaves:
+    """Return leaves with the pairs ``a`` and ``b`` of them that touch."""
     one, other = np.concatenate([a, b]), np.concatenate([b, a])
     order = np.argsort(one.astype(np.int64) * len(node) + other, kind="stable")
     ends = np.cumsum(np.bincount(one, minlength=len(node)))
     return Leaves(
         node=node,
-        first=grid.first[node],
-        count=grid.holds[node],
-        size=grid.edge_length[node],
+        first=first,
+        count=count,
+        size=size,
         a=a,
         b=b,
         start=np.concatenate([[0], ends]).astype(np.int32),
         neighbor=other[order],
+    )
+
+
+def without_gaps(grid: Grid, leaves: Leaves, gap: float) -> Leaves:
+    """Return the leaves without the pairs whose points are far apart, though the boxes touch.
+
+    Args:
+        grid: The sparse grid.
+        leaves: Its leaves.
+        gap: Largest distance of the boxes around the points of two leaves [mm].
+    """
+    wide = np.flatnonzero(leaves.size[leaves.a] + leaves.size[leaves.b] > gap)
+    if len(wide) == 0:
+        return leaves
+    point = runtime.download(grid.point)
+    low = np.minimum.reduceat(point, leaves.first, axis=0)
+    high = np.maximum.reduceat(point, leaves.first, axis=0)
+    a, b = leaves.a[wide], leaves.b[wide]
+    apart = np.maximum(np.maximum(low[a] - high[b], low[b] - high[a]), 0.0)
+    kept = np.ones(len(leaves.a), bool)
+    kept[wide] = np.einsum("ij,ij->i", apart, apart) <= gap**2
+    if kept.all():
+        return leaves
+    return _linked(
+        leaves.node, leaves.first, leaves.count, leaves.size, leaves.a[kept], leaves.b[kept]
     )
 
 

@@ -28,6 +28,9 @@ _UNIT = 1024.0
 # What deviates by no more than this many noises and tilts, and is no larger than this share of the
 # surface beside it, is an error of its form.
 _FORM, _SMOOTH, _SMALL = 4.0, 3.0, 0.25
+# What is cut out of something else as far as it just fits leaves 1.44 noises, evenly spread within
+# 2.5; a surface leaves 1 at most, and two thirds where the noise is taken large to be safe.
+_CUT_OUT = 1.1
 
 
 def contacts(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -234,6 +237,22 @@ def explained_by_others(
         given_up[m] = True
         leaned_on[heirs] = True
     return given_up
+
+
+def cut_out(label: np.ndarray, far: np.ndarray, count: int) -> np.ndarray:
+    """Return which surfaces were cut out of something else as far as that just fitted.
+
+    Args:
+        label: Surface of every point, shape (k,), i32.
+        far: Its distance from it [noises], shape (k,).
+        count: Number of surfaces M.
+
+    Returns:
+        Shape (M,), bool: those whose points leave more than noise does.
+    """
+    square = np.rint(_UNIT * far**2)  # whole units add up alike in any order
+    size = np.bincount(label, minlength=count)
+    return np.bincount(label, square, count) > _UNIT * _CUT_OUT**2 * size
 
 
 def _pairs(

@@ -9,7 +9,7 @@ from reference.labelling import pick
 
 from octoseg_ti.device import runtime
 from octoseg_ti.stages.grid import build_grid
-from octoseg_ti.stages.leaves import sample_leaves
+from octoseg_ti.stages.leaves import sample_leaves, without_gaps
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -27,6 +27,27 @@ def test_the_graph_is_that_of_touching_boxes(seed: int) -> None:
         row = leaves.neighbor[leaves.start[c] : leaves.start[c + 1]].tolist()
         assert row == sorted(next(iter(p - {c})) for p in expected if c in p)
     np.testing.assert_array_equal(leaves.first + leaves.count, np.append(leaves.first[1:], 1500))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("gap", [0.02, 0.2, 1e3])
+def test_pairs_over_a_gap_are_left_out(seed: int, gap: float) -> None:
+    grid, leaves = surface_leaves(seed)
+    point = runtime.download(grid.point)
+    boxes = [point[f : f + n] for f, n in zip(leaves.first, leaves.count, strict=True)]
+
+    def near(a: int, b: int) -> bool:
+        apart = np.maximum(
+            boxes[a].min(axis=0) - boxes[b].max(axis=0), boxes[b].min(axis=0) - boxes[a].max(axis=0)
+        )
+        return float(np.linalg.norm(np.maximum(apart, 0.0))) <= gap
+
+    expected = [(int(a), int(b)) for a, b in zip(leaves.a, leaves.b, strict=True) if near(a, b)]
+    linked = without_gaps(grid, leaves, gap)
+    assert list(zip(linked.a.tolist(), linked.b.tolist(), strict=True)) == expected
+    assert (len(expected) == len(leaves.a)) == (linked is leaves)
+    degree = np.diff(linked.start)
+    assert degree.sum() == len(linked.neighbor) == 2 * len(expected)
 
 
 @pytest.mark.parametrize("seed", range(3))

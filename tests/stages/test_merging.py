@@ -10,6 +10,7 @@ from octoseg_ti.stages.labelling import own_lists
 from octoseg_ti.stages.leaves import Leaves, sample_leaves
 from octoseg_ti.stages.merging import (
     contacts,
+    cut_out,
     explained_by_others,
     members_of,
     merge_surfaces,
@@ -121,3 +122,16 @@ def test_halves_of_a_cylinder_are_merged_and_a_plane_is_not() -> None:
     kept = int(name[0])
     assert merged.kind[kept] == CYLINDER
     np.testing.assert_allclose(merged.parameters[kept, 6], 6.0, atol=0.02)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_was_cut_out_leaves_more_than_noise(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(size=(2, 60))
+    cut = rng.uniform(-2.5, 2.5, size=(2, 60))  # as far as it just fits
+    far = np.concatenate([noise[0], cut[0], 0.67 * noise[1], cut[1]])
+    label = np.repeat([0, 1, 3, 4], 60).astype(np.int32)
+    order = rng.permutation(len(far))
+    limited = np.where(np.abs(far) <= 2.5, far, 0.0)
+    found = cut_out(label[order], limited[order], 6)
+    assert found.tolist() == [False, True, False, False, True, False]
