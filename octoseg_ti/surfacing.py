@@ -26,11 +26,17 @@ from octoseg_ti.stages.labelling import (
     own_lists,
     surface_table,
 )
-from octoseg_ti.stages.leaves import Leaves, Samples, leaf_graph, sample_leaves, without_gaps
+from octoseg_ti.stages.leaves import (
+    Leaves,
+    Samples,
+    leaf_graph,
+    members_of,
+    sample_leaves,
+    without_gaps,
+)
 from octoseg_ti.stages.merging import (
     cut_out,
     explained_by_others,
-    members_of,
     merge_surfaces,
     pieces,
     smooth_contacts,

@@ -5,10 +5,10 @@ The number of a component follows from its first member, so it is the same for a
 
 import numpy as np
 
-from octoseg_ti.device import runtime
+from octoseg_ti.device import runtime, unionfind
 from octoseg_ti.device.linalg import row
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, I64Array, ti
-from octoseg_ti.device.unionfind import find, unite
+from octoseg_ti.device.unionfind import unite
 
 _NEIGHBOURS = 6
 # An edge that comes between two points is not further from both than this share of their distance,
@@ -62,31 +62,22 @@ def link_mesh(
     runtime.sync()
     other = runtime.download(doubtful)[:count]
     one, step = np.nonzero(other >= 0)
-    return _numbered(parent, count), np.column_stack([one, other[one, step]])
+    return _numbered(unionfind.roots(parent)[:count]), np.column_stack([one, other[one, step]])
 
 
 def components(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Return the connected component of every node, shape (count,).
+    """Return the connected component of every node, in the order of their first nodes, (count,).
 
     Args:
         pairs: Linked nodes, shape (P, 2).
         count: Number of nodes.
     """
-    runtime.ensure_started()
-    parent = runtime.upload(np.arange(count, dtype=np.int32))
-    if len(pairs):
-        _unite_pairs(runtime.upload(np.asarray(pairs, np.int32)), parent)
-        runtime.sync()
-    return _numbered(parent, count)
+    return _numbered(unionfind.components(count, pairs[:, 0], pairs[:, 1]))
 
 
-def _numbered(parent: object, count: int) -> np.ndarray:
+def _numbered(root: np.ndarray) -> np.ndarray:
     """Return the numbers of the components, in the order of their first members."""
-    roots = runtime.empty(count, np.int32)
-    _find_roots(parent, roots)
-    runtime.sync()
-    root = runtime.download(roots)[:count]
-    number: np.ndarray = np.cumsum(root == np.arange(count)) - 1
+    number: np.ndarray = np.cumsum(root == np.arange(len(root))) - 1
     return number[root]
 
 
@@ -135,26 +126,3 @@ def _link_mesh(
                         unite(parent_inout, i, j)
                     else:
                         doubtful_out[i, n] = j
-
-
-@ti.kernel
-def _unite_pairs(
-    # In:
-    pairs_in: I32Rows,
-    # Out:
-    parent_inout: I32Array,
-):
-    """Join the components of every pair."""
-    for i in range(pairs_in.shape[0]):
-        unite(parent_inout, pairs_in[i, 0], pairs_in[i, 1])
-
-
-@ti.kernel
-def _find_roots(
-    # Out:
-    parent_inout: I32Array,
-    root_out: I32Array,
-):
-    """Find the first member of the component of every node."""
-    for i in range(parent_inout.shape[0]):
-        root_out[i] = find(parent_inout, i)

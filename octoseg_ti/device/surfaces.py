@@ -90,6 +90,13 @@ def surface_at(kind: ti.i32, point: vec3, origin: vec3, axis: vec3, a: ti.f64, b
     return d, n
 
 
+@ti.func
+def surface_in_row(table: ti.template(), s: ti.i32, kind: ti.i32, point: vec3):
+    """Return what `surface_at` says of the surface whose parameters are row ``s`` of a table."""
+    axis = vec3(table[s, 3], table[s, 4], table[s, 5])
+    return surface_at(kind, point, row(table, s), axis, table[s, 6], table[s, 7])
+
+
 @ti.kernel
 def _evaluate(
     # In:
@@ -104,14 +111,7 @@ def _evaluate(
     """Write distance and normal of every point to the surface that it names."""
     for i in which_in:
         m = which_in[i]
-        d, n = surface_at(
-            kind_in[m],
-            row(point_in, i),
-            row(parameters_in, m),
-            vec3(parameters_in[m, 3], parameters_in[m, 4], parameters_in[m, 5]),
-            parameters_in[m, 6],
-            parameters_in[m, 7],
-        )
+        d, n = surface_in_row(parameters_in, m, kind_in[m], row(point_in, i))
         distance_out[i] = d
         for k in ti.static(range(3)):
             normal_out[i, k] = n[k]

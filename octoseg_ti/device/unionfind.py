@@ -3,6 +3,8 @@
 The root of a set is its smallest member, whatever the order of the unions and the threads.
 """
 
+from typing import Any
+
 import numpy as np
 
 from octoseg_ti.device import runtime
@@ -44,11 +46,31 @@ def _join(
     # Out:
     parent_inout: I32Array,
 ):
-    """Join the two members of every pair, then let every member point to its root."""
+    """Join the two members of every pair."""
     for i in a_in:
         unite(parent_inout, a_in[i], b_in[i])
+
+
+@ti.kernel
+def _find_roots(
+    # Out:
+    parent_inout: I32Array,
+):
+    """Let every member point to its root."""
     for i in parent_inout:
         parent_inout[i] = find(parent_inout, i)
+
+
+def roots(parent: Any) -> np.ndarray:
+    """Return the smallest member of the set of every member.
+
+    Args:
+        parent: What `unite` made of 0, 1, ..., shape (n,), i32 (kernel array); afterwards every
+            member points to its root.
+    """
+    runtime.ensure_started()
+    _find_roots(parent)
+    return runtime.download(parent)
 
 
 def components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -64,8 +86,7 @@ def components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """
     runtime.ensure_started()
     parent = runtime.upload(np.arange(count, dtype=np.int32))
-    if len(a):
-        _join(
-            runtime.upload(np.asarray(a, np.int32)), runtime.upload(np.asarray(b, np.int32)), parent
-        )
-    return runtime.download(parent)
+    if len(a) == 0:
+        return np.arange(count, dtype=np.int32)
+    _join(runtime.upload(np.asarray(a, np.int32)), runtime.upload(np.asarray(b, np.int32)), parent)
+    return roots(parent)

@@ -13,7 +13,15 @@ import numpy as np
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.stages.leaves import Leaves, Samples
-from octoseg_ti.stages.sets import Surfaces, fit_sets, joined, lie_on, no_surfaces, spread
+from octoseg_ti.stages.sets import (
+    Surfaces,
+    capped_rms,
+    fit_sets,
+    joined,
+    lie_on,
+    no_surfaces,
+    spread,
+)
 from octoseg_ti.types import NONE
 
 # A sample lies on a surface within this many noises.
@@ -89,7 +97,9 @@ def explain(
     turn = max(tolerance.turn, 0.5)
     on = lie_on(samples, sets, fitted, whole, (_ON + 0.5) * noise, turn)
     likely, sure = np.zeros(len(sets), bool), np.zeros(len(sets), bool)
-    for s, there, rms in zip(fitted, on, _rms_on(samples, sets, fitted, whole, on), strict=True):
+    lying = [sets[s][there] for s, there in zip(fitted, on, strict=True)]
+    left = capped_rms(samples, lying, np.arange(len(fitted)), whole, noise)
+    for s, there, rms in zip(fitted, on, left, strict=True):
         weight = samples.weight[sets[s]]
         likely[s] = weight[there].sum() >= _WHOLE * weight.sum()
         sure[s] = likely[s] and rms <= _SURE * noise
@@ -102,25 +112,6 @@ def explain(
             kept.append(m)
     label[found >= 0] = found[found >= 0] + len(kept)
     return whole.at(np.array(kept, np.int64)).joined(more), label
-
-
-def _rms_on(
-    samples: Samples,
-    sets: list[np.ndarray],
-    which: np.ndarray,
-    surfaces: Surfaces,
-    on: list[np.ndarray],
-) -> np.ndarray:
-    """Return the residual of the samples that lie on every surface [mm], shape (M,)."""
-    lying = [sets[s][there] for s, there in zip(which, on, strict=True)]
-    count = np.array([len(i) for i in lying], np.int64)
-    if count.sum() == 0:
-        return np.full(len(count), np.inf)
-    owner = np.repeat(np.arange(len(count)), count)
-    far, _ = evaluate_surfaces(
-        samples.point[np.concatenate(lying)], owner, surfaces.kind, surfaces.parameters
-    )
-    return np.sqrt(np.bincount(owner, far**2, len(count)) / np.maximum(count, 1))
 
 
 def _neighborhoods(point: np.ndarray, seeds: np.ndarray, count: int) -> np.ndarray:

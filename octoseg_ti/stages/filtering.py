@@ -45,6 +45,17 @@ def _row32(rows: ti.template(), i: ti.i32) -> _vec3_f32:
     return _vec3_f32(rows[i, 0], rows[i, 1], rows[i, 2])
 
 
+@ti.func
+def _write_direction(total, before, i: ti.i32, normal_out: ti.template()):
+    """Write the direction of a sum of normals, or the normal before where they cancel."""
+    size = total.norm()
+    n = before
+    if size > 0:
+        n = total / size
+    for k in ti.static(range(3)):
+        normal_out[i, k] = n[k]
+
+
 @ti.kernel
 def _find_partners(
     stripes: ti.i32,
@@ -155,11 +166,7 @@ def _average_near(
             if ti.static(k >= 4):
                 w = w * ti.cast(_DIAGONAL, ti.f32)
             total += w * m
-        size = total.norm()
-        if size > 0:
-            n = total / size
-        for k in ti.static(range(3)):
-            normal_out[i, k] = n[k]
+        _write_direction(total, n, i, normal_out)
 
 
 @ti.kernel
@@ -181,11 +188,7 @@ def _average(
             if ti.static(k >= 4):
                 w = w * ti.cast(_DIAGONAL, ti.f32)
             total += w * _row32(normal_in, j)
-        size = total.norm()
-        if size > 0:
-            n = total / size
-        for k in ti.static(range(3)):
-            normal_out[i, k] = n[k]
+        _write_direction(total, n, i, normal_out)
 
 
 @ti.kernel

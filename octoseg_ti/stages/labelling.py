@@ -12,7 +12,7 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F32Rows, F64Rows, I32Array, I32Rows, ti
-from octoseg_ti.device.surfaces import surface_at
+from octoseg_ti.device.surfaces import surface_in_row
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.leaves import Leaves, distinct
 from octoseg_ti.types import NONE
@@ -117,10 +117,7 @@ def _choose(
             k = 0
             while k < MOST and near_in[c, k] >= 0:
                 s = near_in[c, k]
-                kind = ti.cast(surface_in[s, 8], ti.i32)
-                origin = row(surface_in, s)
-                axis = vec3(surface_in[s, 3], surface_in[s, 4], surface_in[s, 5])
-                d, n = surface_at(kind, p, origin, axis, surface_in[s, 6], surface_in[s, 7])
+                d, n = surface_in_row(surface_in, s, ti.cast(surface_in[s, 8], ti.i32), p)
                 off = ti.abs(d) / rule[0]
                 least = off * off + surface_in[s, 9]
                 if least < after[0] or (off <= rule[2] and least < best[0]):

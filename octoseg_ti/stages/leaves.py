@@ -7,6 +7,7 @@ order in which they were scanned.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,8 +16,8 @@ from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, I64Rows, ti
 from octoseg_ti.stages.adjacency import Adjacency
 from octoseg_ti.stages.grid import Grid
 
-# Odd numbers with well mixed bits (the first digits of the roots of 2, 3 and 5, times 2^63).
 _FINE = 1024.0  # steps of the rounding in a smallest cell
+# Odd numbers with well mixed bits (the first digits of the roots of 2, 3 and 5, times 2^63).
 _MIX = (0x6A09E667F3BCC909, 0x5DB3D742C265539D, 0x1E3779B97F4A7C15)
 
 
@@ -230,3 +231,10 @@ def distinct(key: np.ndarray) -> np.ndarray:
     new = np.ones(len(key), bool)
     new[1:] = key[1:] != key[:-1]
     return key[new]
+
+
+def members_of(label: np.ndarray, count: int) -> list[np.ndarray]:
+    """Return the members of every label 0..count-1, ascending, an array of indices for each."""
+    order = np.argsort(label, kind="stable")
+    ends = np.searchsorted(label[order], np.arange(count + 1))
+    return [order[lo:hi] for lo, hi in pairwise(ends)]

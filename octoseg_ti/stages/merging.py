@@ -1,13 +1,11 @@
 """Surfaces that are one are merged; surfaces that their neighbours explain are given up."""
 
-from itertools import pairwise
-
 import numpy as np
 
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
-from octoseg_ti.stages.leaves import Leaves, Samples, distinct
-from octoseg_ti.stages.sets import Surfaces, fit_sets, spread
+from octoseg_ti.stages.leaves import Leaves, Samples, distinct, members_of
+from octoseg_ti.stages.sets import Surfaces, capped_rms, fit_sets, spread
 from octoseg_ti.types import NONE
 
 # Samples of each surface in a common fit.
@@ -103,13 +101,6 @@ def _pairs_of(key: np.ndarray, own: np.ndarray) -> np.ndarray:
     return np.stack([key // width, key % width], axis=1)
 
 
-def members_of(label: np.ndarray, count: int) -> list[np.ndarray]:
-    """Return the samples of every label, ascending, an array of indices for each."""
-    order = np.argsort(label, kind="stable")
-    ends = np.searchsorted(label[order], np.arange(count + 1))
-    return [order[lo:hi] for lo, hi in pairwise(ends)]
-
-
 def merge_surfaces(
     samples: Samples, label: np.ndarray, surfaces: Surfaces, pairs: np.ndarray, noise: float
 ) -> tuple[np.ndarray, Surfaces]:
@@ -168,26 +159,6 @@ def _residuals(
     mixed = capped_rms(samples, parts, which, common.at(twice), noise)
     own = capped_rms(samples, parts, np.arange(len(surfaces)), surfaces, noise)
     return mixed.reshape(-1, 2), own[pairs]
-
-
-def capped_rms(
-    samples: Samples, sets: list[np.ndarray], which: np.ndarray, surfaces: Surfaces, noise: float
-) -> np.ndarray:
-    """Return the residual of a set of samples from every surface, far samples capped [mm].
-
-    Args:
-        samples: The samples.
-        sets: Sets of samples.
-        which: The set that every surface is compared with, shape (M,).
-        surfaces: The surfaces.
-        noise: Deviation of a point from its surface [mm]; distances count as 4 of it at most.
-    """
-    length = np.array([len(s) for s in sets], np.int64)[which]
-    index = np.concatenate([sets[w] for w in which])
-    owner = np.repeat(np.arange(len(which)), length)
-    far, _ = evaluate_surfaces(samples.point[index], owner, surfaces.kind, surfaces.parameters)
-    square = np.minimum(far**2, (_CAP * noise) ** 2)
-    return np.sqrt(np.bincount(owner, square, len(which)) / np.maximum(length, 1))
 
 
 def explained_by_others(

@@ -12,9 +12,9 @@ much, surfaces are fitted.
 import numpy as np
 
 from octoseg_ti.device import runtime
+from octoseg_ti.fitting.primitives import FREEDOM, fit_all
+from octoseg_ti.fitting.quadrics import QUADRIC_FREEDOM, fit_quadrics
 from octoseg_ti.stages.grid import Grid
-from octoseg_ti.stages.primitives import FREEDOM, fit_all
-from octoseg_ti.stages.quadrics import QUADRIC_FREEDOM, fit_quadrics
 
 # Neighbourhoods, and the points of each.
 _COUNT, _POINTS = 256, 128

@@ -5,17 +5,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from octoseg_ti.device import runtime
-from octoseg_ti.device.linalg import row, vec3
+from octoseg_ti.device.linalg import row
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
-from octoseg_ti.device.surfaces import KINDS, surface_at
+from octoseg_ti.device.surfaces import KINDS, evaluate_surfaces, surface_in_row
+from octoseg_ti.fitting.primitives import fit_all
+from octoseg_ti.fitting.quadrics import fit_quadrics
+from octoseg_ti.fitting.selection import choose, plane_does
 from octoseg_ti.stages.leaves import Samples
-from octoseg_ti.stages.primitives import fit_all
-from octoseg_ti.stages.quadrics import fit_quadrics
-from octoseg_ti.stages.selection import choose, plane_does
 from octoseg_ti.types import SurfaceKind
 
 # A surface fits when its residual is below this many noises.
 _FIT = 1.5
+# Distances beyond this many noises count as this many.
+_CAP = 4.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,13 +75,9 @@ def _lie_on(
     """Say for every surface which samples of its range lie on it."""
     for s in range(range_in.shape[0]):
         kind = ti.cast(surface_in[s, 8], ti.i32)
-        origin = row(surface_in, s)
-        axis = vec3(surface_in[s, 3], surface_in[s, 4], surface_in[s, 5])
         for j in range(range_in[s, 0], range_in[s, 1]):
             i = sample_in[j]
-            d, n = surface_at(
-                kind, row(point_in, i), origin, axis, surface_in[s, 6], surface_in[s, 7]
-            )
+            d, n = surface_in_row(surface_in, s, kind, row(point_in, i))
             m = row(normal_in, i)
             on = ti.cast(ti.abs(d) <= limit, ti.i32)
             if ti.abs(n.dot(m)) < cosine and m.norm_sqr() > 0.0:
@@ -135,6 +133,29 @@ def spread(members: np.ndarray, most: int) -> np.ndarray:
     if len(members) <= most:
         return members
     return members[(2 * np.arange(most) + 1) * len(members) // (2 * most)]
+
+
+def capped_rms(
+    samples: Samples, sets: list[np.ndarray], which: np.ndarray, surfaces: Surfaces, noise: float
+) -> np.ndarray:
+    """Return the residual of a set of samples from every surface, far samples capped [mm].
+
+    Args:
+        samples: The samples.
+        sets: Sets of samples.
+        which: The set that every surface is compared with, shape (M,).
+        surfaces: The surfaces.
+        noise: Deviation of a point from its surface [mm]; distances count as 4 of it at most.
+
+    Returns:
+        Shape (M,); 0 of an empty set.
+    """
+    length = np.array([len(s) for s in sets], np.int64)[which]
+    index = np.concatenate([np.zeros(0, np.int64), *(sets[w] for w in which)])
+    owner = np.repeat(np.arange(len(which)), length)
+    far, _ = evaluate_surfaces(samples.point[index], owner, surfaces.kind, surfaces.parameters)
+    square = np.minimum(far**2, (_CAP * noise) ** 2)
+    return np.sqrt(np.bincount(owner, square, len(which)) / np.maximum(length, 1))
 
 
 def fit_sets(

@@ -6,7 +6,7 @@ from reference.graph import components
 
 from octoseg_ti.device import runtime, unionfind
 from octoseg_ti.device.runtime import I32Array, I32Rows, ti
-from octoseg_ti.device.unionfind import find, unite
+from octoseg_ti.device.unionfind import unite
 
 
 @ti.kernel
@@ -21,26 +21,11 @@ def _join(
         unite(parent_inout, edge_in[e, 0], edge_in[e, 1])
 
 
-@ti.kernel
-def _roots(
-    # In:
-    parent_in: I32Array,
-    # Out:
-    root_out: I32Array,
-):
-    """Write the root of every member."""
-    ti.loop_config(serialize=True)
-    for i in range(root_out.shape[0]):
-        root_out[i] = find(parent_in, i)
-
-
 def roots(n: int, edges: np.ndarray) -> list[int]:
     runtime.ensure_started()
     parent = runtime.upload(np.arange(n, dtype=np.int32))
     _join(runtime.upload(edges.astype(np.int32).reshape(-1, 2)), parent)
-    root = runtime.empty(n, np.int32)
-    _roots(parent, root)
-    return runtime.download(root)[:n].tolist()
+    return unionfind.roots(parent)[:n].tolist()
 
 
 def walked(n: int, edges: np.ndarray) -> list[int]:

@@ -6,7 +6,7 @@ import numpy as np
 
 
 def fit_quadric(point: np.ndarray, normal: np.ndarray) -> dict[str, np.ndarray | float]:
-    """Return what `octoseg_ti.stages.quadrics` tells of one group, by names."""
+    """Return what `octoseg_ti.fitting.quadrics` tells of one group, by names."""
     centre = point.mean(axis=0)
     q = point - centre
     axes = np.linalg.svd(q)[2]

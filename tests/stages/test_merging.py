@@ -7,12 +7,11 @@ from reference.device_grid import samples_of, surface_leaves
 from reference.surfaces import CYLINDER, PLANE, patch_of
 
 from octoseg_ti.stages.labelling import own_lists
-from octoseg_ti.stages.leaves import Leaves, sample_leaves
+from octoseg_ti.stages.leaves import Leaves, members_of, sample_leaves
 from octoseg_ti.stages.merging import (
     contacts,
     cut_out,
     explained_by_others,
-    members_of,
     merge_surfaces,
     pieces,
     smooth_contacts,

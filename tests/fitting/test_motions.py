@@ -9,7 +9,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import vec3
 from octoseg_ti.device.runtime import F64Rows, ti
 from octoseg_ti.device.surfaces import KINDS, cone_shape, vec4
-from octoseg_ti.stages.motions import (
+from octoseg_ti.fitting.motions import (
     FREE,
     STATE,
     UNKNOWNS,
@@ -20,7 +20,7 @@ from octoseg_ti.stages.motions import (
     step_state,
     vec7,
 )
-from octoseg_ti.stages.primitives import to_parameters
+from octoseg_ti.fitting.primitives import to_parameters
 
 
 @ti.func

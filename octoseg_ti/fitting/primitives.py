@@ -7,10 +7,10 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, ti
-from octoseg_ti.device.surfaces import CONE, CYLINDER, KINDS, SPHERE, TORUS, surface_at
-from octoseg_ti.stages.fitting import iterate
-from octoseg_ti.stages.motions import FREE, moved
-from octoseg_ti.stages.starts import gather_moments, starts
+from octoseg_ti.device.surfaces import CONE, CYLINDER, KINDS, SPHERE, TORUS, surface_in_row
+from octoseg_ti.fitting.descent import iterate
+from octoseg_ti.fitting.motions import FREE, moved
+from octoseg_ti.fitting.starts import gather_moments, starts
 
 FREEDOM = FREE.sum(axis=1)
 """Degrees of freedom of every kind."""
@@ -76,17 +76,13 @@ def _judge(
     for e in range(tasks * stride):
         if e % stride == 0:
             t = e // stride
-            origin = row(parameters_in, t)
-            axis = vec3(parameters_in[t, 3], parameters_in[t, 4], parameters_in[t, 5])
-            a = parameters_in[t, 6]
-            b = parameters_in[t, 7]
             reach = reach_in[t]
             weights = vec3(0.0, 0.0, 0.0)
             squares = vec3(0.0, 0.0, 0.0)
             signed = 0.0
             size = 0.0
             for i in range(start_in[t // KINDS], start_in[t // KINDS + 1]):
-                d, n = surface_at(t % KINDS, row(point_in, i), origin, axis, a, b)
+                d, n = surface_in_row(parameters_in, t, t % KINDS, row(point_in, i))
                 w = weight_in[i]
                 left = 1.0
                 loss = d * d
@@ -124,17 +120,8 @@ def _count_distances(
     for e in range(tasks * stride):
         if e % stride == 0:
             t = e // stride
-            origin = row(parameters_in, t)
-            axis = vec3(parameters_in[t, 3], parameters_in[t, 4], parameters_in[t, 5])
             for i in range(start_in[t // KINDS], start_in[t // KINDS + 1]):
-                d, _ = surface_at(
-                    t % KINDS,
-                    row(point_in, i),
-                    origin,
-                    axis,
-                    parameters_in[t, 6],
-                    parameters_in[t, 7],
-                )
+                d, _ = surface_in_row(parameters_in, t, t % KINDS, row(point_in, i))
                 ratio = ti.abs(d) / least_in[t // KINDS]
                 if weight_in[i] > 0.0:
                     k = 0

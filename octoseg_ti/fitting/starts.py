@@ -15,7 +15,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import mat3, row, vec2, vec3
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, ti
 from octoseg_ti.device.surfaces import CONE, CYLINDER, KINDS, PLANE, SPHERE, TORUS
-from octoseg_ti.stages.motions import STATE
+from octoseg_ti.fitting.motions import STATE
 
 _DIRECTIONS = 6  # tried as axis
 _FAR = 1e3  # no start is farther from the points than this, in units of their extent

@@ -7,8 +7,8 @@ from reference.surfaces import CONE, PLANE, SPHERE, TORUS, distance_of, patch_of
 
 from octoseg_ti.device import runtime
 from octoseg_ti.device.surfaces import KINDS
-from octoseg_ti.stages.primitives import _Samples, to_parameters
-from octoseg_ti.stages.starts import _profile_means, gather_moments, starts
+from octoseg_ti.fitting.primitives import _Samples, to_parameters
+from octoseg_ti.fitting.starts import _profile_means, gather_moments, starts
 
 
 def cloud(seed: int, sizes: list[int]) -> tuple[np.ndarray, ...]:

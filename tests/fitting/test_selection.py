@@ -5,8 +5,8 @@ import pytest
 from reference.clouds import rotation
 from reference.surfaces import CONE, CYLINDER, PLANE, SPHERE, TORUS, patch_of, placed
 
-from octoseg_ti.stages.primitives import fit_all
-from octoseg_ti.stages.selection import Choice, choose
+from octoseg_ti.fitting.primitives import fit_all
+from octoseg_ti.fitting.selection import Choice, choose
 from octoseg_ti.types import SurfaceKind
 
 

@@ -6,9 +6,9 @@ from reference.clouds import rotation
 from reference.quadrics import fit_quadric
 from reference.surfaces import CYLINDER, PLANE, SPHERE, TORUS, patch_of
 
-from octoseg_ti.stages.primitives import fit_all
-from octoseg_ti.stages.quadrics import fit_quadrics
-from octoseg_ti.stages.selection import choose, plane_does
+from octoseg_ti.fitting.primitives import fit_all
+from octoseg_ti.fitting.quadrics import fit_quadrics
+from octoseg_ti.fitting.selection import choose, plane_does
 
 
 def bowls(seed: int, groups: int = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

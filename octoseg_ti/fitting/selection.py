@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from octoseg_ti.device.surfaces import KINDS
-from octoseg_ti.stages.primitives import FREEDOM, Fits, covariance
-from octoseg_ti.stages.quadrics import Quadrics
+from octoseg_ti.fitting.primitives import FREEDOM, Fits, covariance
+from octoseg_ti.fitting.quadrics import Quadrics
 from octoseg_ti.types import SurfaceKind
 
 # A parameter more has to gain this many times log(n) in log-likelihood (times 2). BIC asks for 1

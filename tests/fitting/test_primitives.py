@@ -7,7 +7,7 @@ from reference.surfaces import CONE, CYLINDER, PLANE, SPHERE, TORUS, distance_of
 from scipy.optimize import least_squares
 
 from octoseg_ti.device.surfaces import KINDS
-from octoseg_ti.stages.primitives import FREEDOM, Fits, covariance, fit_all
+from octoseg_ti.fitting.primitives import FREEDOM, Fits, covariance, fit_all
 
 
 def measured(

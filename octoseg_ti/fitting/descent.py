@@ -21,7 +21,7 @@ from octoseg_ti.device.surfaces import (
     cone_shape,
     vec4,
 )
-from octoseg_ti.stages.motions import (
+from octoseg_ti.fitting.motions import (
     FREE,
     STATE,
     UNKNOWNS,
