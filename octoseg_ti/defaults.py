@@ -51,9 +51,14 @@ CHANCE = 0.0015
 """... or by so much that one in so many points that lie anywhere, at a distance of up to a spacing
 from it, and face anywhere would: where positions are exact they tell by themselves, and normals of
 narrow faces are those of their neighbourhood."""
-EVIDENCE = 105.0
-"""Fewest points of a surface, times the logarithm of how many noises there are in a spacing: the
-more each point tells, the fewer prove a surface."""
+PROOF = 30.0
+"""How sure a surface has to be, as a logarithm: of so many surfaces through a few points each, tried
+anywhere, hardly one has the other points that it needs by chance."""
+WINDOW = 6.0
+"""A point lies on a surface by chance when it is within this many noises, both sides together, of all
+places a spacing apart."""
+FREEDOM = 3
+"""Points that the simplest surface goes through anyway."""
 LEAST_TILT = 0.05
 """Deviation of the normals from those of a surface even on perfect data [rad]: edges smear them."""
 
@@ -137,8 +142,9 @@ def derive(params: Params, measured: Measurement) -> Params:
         surfaces = replace(surfaces, turn=turn)
     if surfaces.min_points is None:
         fewest = regions.min_points
-        if exact > 1.0:
-            fewest = min(fewest, math.ceil(EVIDENCE / math.log(exact)))
+        if exact > WINDOW:
+            # The more each point tells, the fewer prove a surface.
+            fewest = min(fewest, FREEDOM + math.ceil(PROOF / math.log(exact / WINDOW)))
         surfaces = replace(surfaces, min_points=fewest)
     return replace(
         params,
