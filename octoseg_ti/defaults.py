@@ -52,11 +52,11 @@ CHANCE = 0.0015
 from it, and face anywhere would: where positions are exact they tell by themselves, and normals of
 narrow faces are those of their neighbourhood."""
 PROOF = 30.0
-"""How sure a surface has to be, as a logarithm: of so many surfaces through a few points each, tried
-anywhere, hardly one has the other points that it needs by chance."""
+"""How sure a surface has to be, as a logarithm: of so many surfaces through a few points each,
+tried anywhere, hardly one has the other points that it needs by chance."""
 WINDOW = 6.0
-"""A point lies on a surface by chance when it is within this many noises, both sides together, of all
-places a spacing apart."""
+"""A point lies on a surface by chance when it is within this many noises, both sides together,
+of all places a spacing apart."""
 FREEDOM = 3
 """Points that the simplest surface goes through anyway."""
 LEAST_TILT = 0.05

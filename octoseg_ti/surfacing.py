@@ -53,7 +53,7 @@ _AROUND, _HARDLY = 12, 1e-3
 _NARROW = 2.0
 # ... where positions are so exact that a surface needs no more than this share of the points of a
 # patch: they tell by themselves.
-_ALONE = 0.5
+_ALONE = 0.33
 # A leaf takes part in a new group when so many of its points fit nothing, or one in so many.
 _LEFT_POINTS, _LEFT_SHARE = 2, 3
 # Samples for fitting a surface anew.
@@ -253,8 +253,8 @@ class _Search:
         """Give up small surfaces that were cut out of the ragged rim of something else."""
         label = self.label
         size = np.bincount(label[label >= 0], minlength=len(self.surfaces))
-        small = (size > 0) & (size < _FREE * self.tolerance.points)
-        here = np.flatnonzero((label >= 0) & small[label])
+        small = size < _FREE * self.tolerance.points
+        here = np.flatnonzero(np.append(small, False)[label])
         if len(here) == 0:
             return
         point, name = runtime.download(self.grid.point)[here], label[here]
@@ -354,14 +354,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
     gap = params.normals.gap
     near = graph if gap is None else without_gaps(grid, graph, _GAPS * gap)
     label, surface = number_pieces(near, surfaced, least, fewest)
-    # Regions of which surfaces explain less than half stay; they are free forms.
-    rest = (label < 0) & (found.label >= 0)
-    size = np.bincount(found.label[found.label >= 0], minlength=found.count)
-    left = np.bincount(found.label[rest], minlength=found.count)
-    stay = np.flatnonzero((2 * left >= size) & (left >= least))
-    number = np.full(found.count + 1, NONE, np.int32)
-    number[stay] = len(surface) + np.arange(len(stay), dtype=np.int32)
-    label[rest] = number[found.label[rest]]
+    label, surface, free = _with_free_forms(label, surface, found, least)
     # What is left joins the nearest patch, within reason.
     if np.any(label < 0) and len(surface):
         table = surface_table(
@@ -380,12 +373,43 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         found,
         label=label,
         cell_label=np.where(found.cell_label >= 0, held, NONE).astype(np.int32),
-        count=len(surface) + len(stay),
-        surface=np.concatenate([surface, np.full(len(stay), NONE, np.int32)]),
+        count=len(surface) + free,
+        surface=np.concatenate([surface, np.full(free, NONE, np.int32)]),
         kind=surfaced.surfaces.kind,
         parameters=surfaced.surfaces.parameters,
         graph=graph,
     )
+
+
+def _with_free_forms(
+    label: np.ndarray, surface: np.ndarray, found: Regions, least: float
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Give the regions that surfaces do not explain back what they leave: these are free forms.
+
+    Args:
+        label: Patch of every sorted point, -1 = none, shape (n,), i32.
+        surface: Surface of every patch.
+        found: The regions of the flood fill.
+        least: A region with fewer points is no patch.
+
+    Returns:
+        Patch of every point, the free forms last; surface of every other patch; and how many free
+        forms there are.
+    """
+    rest = (label < 0) & (found.label >= 0)
+    size = np.bincount(found.label[found.label >= 0], minlength=found.count)
+    left = np.bincount(found.label[rest], minlength=found.count)
+    stay = np.flatnonzero((2 * left >= size) & (left >= least))
+    # Nothing tells a small surface within a free form from a part of it.
+    size = np.bincount(label[label >= 0], minlength=len(surface))
+    within = np.bincount(label[(label >= 0) & np.isin(found.label, stay)], minlength=len(surface))
+    kept = (size >= least) | (2 * within < size)
+    number = np.full(len(surface) + 1, NONE, np.int32)
+    number[:-1][kept] = np.arange(np.count_nonzero(kept), dtype=np.int32)
+    label, surface = number[label], surface[kept]
+    number = np.full(found.count + 1, NONE, np.int32)
+    number[stay] = len(surface) + np.arange(len(stay), dtype=np.int32)
+    return np.where(label < 0, number[found.label], label), surface, len(stay)
 
 
 def number_pieces(
