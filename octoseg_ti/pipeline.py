@@ -104,7 +104,7 @@ def segment(
     with stage("surfaces"):
         curved = arranged.run is None
         measured, params, found = explain_regions(
-            grid, leaves, found, measured, params, asked, curved=curved
+            grid, leaves, found, arranged.view, measured, params, asked, curved=curved
         )
     with stage("borders"):
         borders = trace_borders(grid, found, measured, params)
@@ -317,6 +317,7 @@ def explain_regions(
     grid: Grid,
     leaves: np.ndarray,
     found: Regions,
+    view: np.ndarray,
     measured: Measurement,
     params: Params,
     asked: SurfaceParams,
@@ -331,7 +332,7 @@ def explain_regions(
     # Fits add up fourth powers of lengths, which beyond this leave the range of numbers.
     if not params.surfaces.enabled or not 1.0 / _LONGEST < extent < _LONGEST:
         return measured, params, found
-    scatter = surface_noise(grid, leaves, found.group[leaves])
+    scatter = surface_noise(grid, leaves, found.group[leaves], view)
     if scatter is not None:
         measured = replace(measured, surface_noise=scatter)
         if curved:

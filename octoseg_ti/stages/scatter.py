@@ -7,6 +7,11 @@ through neighbourhoods of about a hundred points of one region: of half of them,
 through some of the others. (Where faces are a few neighbourhoods large, edges would run through
 nearly all if regions did not keep them apart.) A quadric does for most of them; where it bends too
 much, surfaces are fitted.
+
+Poses are in error from view to view, not from point to point: in one place views meet well, in
+another they do not, and in most there may be one view only. So where views meet, the scatter of
+each about a surface of its own is told from what they are apart, and nearly the most of the latter
+counts.
 """
 
 import numpy as np
@@ -27,15 +32,22 @@ _CALM, _MIDDLE, _EDGES = 0.25, 0.6, 1.5
 _BEND = 0.35
 # Where it leaves so many times what it leaves of the calm ones, there is an edge.
 _EDGE = 8.0
+# Views are apart by this quantile of what they are where they meet, if they do in so many places.
+_APART, _MEETINGS = 0.75, 16
+# Chance alone tells them apart by less than this share of the scatter.
+_CHANCE = 0.3
 
 
-def surface_noise(grid: Grid, leaves: np.ndarray, group: np.ndarray) -> float | None:
+def surface_noise(
+    grid: Grid, leaves: np.ndarray, group: np.ndarray, view: np.ndarray
+) -> float | None:
     """Return the standard deviation of points about the surface through their neighbourhood [mm].
 
     Args:
         grid: The sparse grid: points that follow one another in Morton order are near each other.
         leaves: The nodes that are leaves, in Morton order, shape (C,).
         group: Region of every leaf, -1 = none, shape (C,), i32.
+        view: View of every point, in the order in which they went into the grid, shape (n,), i32.
 
     Returns:
         The deviation; None where no region is large enough to tell.
@@ -65,8 +77,55 @@ def surface_noise(grid: Grid, leaves: np.ndarray, group: np.ndarray) -> float | 
     order = np.lexsort((*point.T, np.repeat(np.arange(len(count)), count)))
     point, normal = point[order], runtime.download(grid.normal)[index[order]]
     rms = _residuals(point, normal, np.append(begin, len(index)))
+    seen = view[runtime.download(grid.order)[index[order]]]
+    within, apart = _by_view(point, normal, seen, np.repeat(np.arange(len(count)), count), rms)
+    both = float(np.hypot(_typical(within), apart))
+    return max(_typical(rms), both) if apart > _CHANCE * _typical(within) else _typical(rms)
+
+
+def _typical(rms: np.ndarray) -> float:
+    """Return what surfaces leave of a usual neighbourhood without an edge [mm]."""
     calm, middle = np.quantile(rms, [_CALM, _MIDDLE])
     return float(min(middle, _EDGES * calm))
+
+
+def _by_view(
+    point: np.ndarray, normal: np.ndarray, view: np.ndarray, group: np.ndarray, rms: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return how far points scatter about surfaces of their views, and how far views are apart.
+
+    Args:
+        point: Points of the groups, one group after the other [mm], shape (S, 3).
+        normal: Their normals, shape (S, 3).
+        view: Their views, shape (S,).
+        group: Their groups, rising, shape (S,).
+        rms: What one surface leaves of every group [mm], shape (G,).
+
+    Returns:
+        What the surfaces of its views leave of every group [mm], shape (G,); and the deviation of
+        the views from the surfaces that they share [mm], 0 where too few meet.
+    """
+    order = np.lexsort((view, group))
+    piece = np.cumsum(np.diff(group[order] * (view.max() + 1) + view[order], prepend=-1) > 0) - 1
+    count = np.bincount(piece)
+    name = group[order][np.cumsum(count) - count]
+    large = count >= _FEWEST
+    large &= np.bincount(name[large], minlength=len(rms))[name] > 1
+    if not large.any():
+        return rms, 0.0
+    rows = order[large[piece]]
+    start = np.concatenate([[0], np.cumsum(count[large])]).astype(np.int32)
+    own = _residuals(point[rows], normal[rows], start)
+    number = np.bincount(name[large], count[large], len(rms))
+    meet = number > 0
+    within = rms.copy()
+    square = np.bincount(name[large], count[large] * own**2, len(rms))
+    within[meet] = np.sqrt(square[meet] / number[meet])
+    meet &= within <= _EDGES * np.quantile(within, _CALM)
+    if np.count_nonzero(meet) < _MEETINGS:
+        return within, 0.0
+    apart = np.sqrt(np.maximum(rms[meet] ** 2 - within[meet] ** 2, 0.0))
+    return within, float(np.quantile(apart, _APART))
 
 
 def _residuals(point: np.ndarray, normal: np.ndarray, start: np.ndarray) -> np.ndarray:

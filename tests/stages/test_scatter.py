@@ -9,11 +9,15 @@ from octoseg_ti.stages.grid import build_grid
 from octoseg_ti.stages.scatter import surface_noise
 
 
-def noise_of(points: np.ndarray, normals: np.ndarray) -> float | None:
+def noise_of(
+    points: np.ndarray, normals: np.ndarray, view: np.ndarray | None = None
+) -> float | None:
     """Return the noise of points that are all of one region."""
     grid = build_grid(points, normals, tolerance=0.15, min_cell=0.3, min_points=3)
     leaves = touching_leaves(grid).node
-    return surface_noise(grid, leaves, np.zeros(len(leaves), np.int32))
+    if view is None:
+        view = np.zeros(len(points), np.int32)
+    return surface_noise(grid, leaves, np.zeros(len(leaves), np.int32), view)
 
 
 @pytest.mark.parametrize("noise", [0.005, 0.03])
@@ -30,6 +34,27 @@ def test_perfect_data_have_next_to_none() -> None:
     found = noise_of(points, normals)
     assert found is not None
     assert found < 1e-4
+
+
+@pytest.mark.parametrize("shared", [1.0, 0.25])
+def test_views_that_do_not_quite_meet_scatter_more(shared: float) -> None:
+    """Two views, one of them 0.06 mm too high: half of that off their mean, where both were."""
+    rng = np.random.default_rng(0)
+    points, normals, _ = patch_of(PLANE, rng, 20000, size=12.0)
+    low, high = np.quantile(points @ patch_axis(normals), [0.0, shared])
+    view = rng.integers(0, 2, len(points)).astype(np.int32)
+    place = points @ patch_axis(normals)
+    view[(place < low) | (place > high)] = 0
+    points += 0.005 * rng.normal(size=points.shape)
+    apart = points + 0.06 * view[:, None] * normals
+    np.testing.assert_allclose(noise_of(apart, normals, view), np.hypot(0.03, 0.005), rtol=0.1)
+    np.testing.assert_allclose(noise_of(points, normals, view), 0.005, rtol=0.1)
+
+
+def patch_axis(normals: np.ndarray) -> np.ndarray:
+    """Return a direction in a plane."""
+    axis = np.cross(normals[0], [1.0, 0.3, 0.2])
+    return np.asarray(axis / np.linalg.norm(axis))
 
 
 def test_the_order_of_the_points_does_not_matter() -> None:
