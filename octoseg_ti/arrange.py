@@ -77,10 +77,16 @@ def as_scans(
                 f"not {value.shape}"
             )
         checked[name] = value
+    if scans.stripe_origin is not None:
+        places = np.asarray(scans.stripe_origin, np.float64)
+        stripe = checked["stripe"]
+        stripes = 0 if stripe is None else int(stripe.max()) + 1
+        if places.shape[1:] != (3,) or len(places) < stripes:
+            raise DataError(f"stripe_origin must be of shape ({stripes}, 3), not {places.shape}")
+        checked["stripe_origin"] = places
     return Scans(
-        **checked, column=scans.column, time_ns=scans.time_ns, frame=scans.frame, name=scans.name,
-        stripe_origin=scans.stripe_origin,
-    )  # fmt: skip
+        **checked, column=scans.column, time_ns=scans.time_ns, frame=scans.frame, name=scans.name
+    )
 
 
 def _rows(name: str, value: np.ndarray, n: int | None) -> np.ndarray:

@@ -18,7 +18,9 @@ class CleaningParams:
     """Marking of spikes, isolated points and detached groups (I3)."""
 
     enabled: bool = True
-    """Mark spikes, isolated points and small detached groups before normals are estimated."""
+    """Mark spikes, isolated points and small detached groups before normals are estimated; and,
+    where the position of the probe at every stripe is known, regions that it cannot have seen:
+    mirror images behind the surface of the part."""
     spike: float | None = None
     """Smallest distance of a spike from the surfaces around it [mm]; default: from noise and
     spacing."""

@@ -75,6 +75,8 @@ class Regions:
     """Parameters of every such surface, relative to the corner of the grid."""
     graph: Leaves | None = None
     """The leaves as a graph, when surfaces were looked for."""
+    mirrored: np.ndarray | None = None
+    """Whether a sorted point is of a mirror image, shape (n,), bool; None = none is."""
 
 
 def grow_regions(
@@ -216,8 +218,11 @@ def assemble(
         initial_size=grid.size,
     )
     edge, fillets = rows.edge, None
+    row = arranged.row[runtime.download(grid.order)]
     if borders is not None:
-        edge, fillets = _fillets(borders, arranged.row[runtime.download(grid.order)], n, name, rank)
+        edge, fillets = _fillets(borders, row, n, name, rank)
+    if found.mirrored is not None:
+        outlier[row[found.mirrored]] = 1
     return Segmentation(
         points=rows.points, normals=rows.normals, labels=rows.labels, edge=edge, fillets=fillets,
         level=rows.level, outlier=outlier, kind=kind[rank],

@@ -13,6 +13,7 @@ from octoseg_ti.borders import Borders, find_borders
 from octoseg_ti.defaults import derive, spacing_of
 from octoseg_ti.device import runtime
 from octoseg_ti.device.profiling import Trace
+from octoseg_ti.mirrors import probe_positions, without_mirror_images
 from octoseg_ti.params import Params, SurfaceParams, preset_params
 from octoseg_ti.patches import Regions, assemble, grow_regions
 from octoseg_ti.stages.cleaning import mark_outliers
@@ -106,6 +107,9 @@ def segment(
         measured, params, found = explain_regions(
             grid, leaves, found, arranged.view, measured, params, asked, curved=curved
         )
+        probe = probe_positions(scans, arranged, aligned) if params.cleaning.enabled else None
+        if probe is not None:
+            found = without_mirror_images(grid, leaves, found, arranged, probe)
     with stage("borders"):
         borders = trace_borders(grid, found, measured, params)
     with stage("patches"):
@@ -113,7 +117,7 @@ def segment(
             scans, arranged, point, normal, grid, leaves, found, borders, measured, params
         )
     if aligned is not None:
-        result = with_registration(result, scans, aligned)
+        result = with_registration(result, scans, arranged, aligned)
     return replace(result, seconds=trace.seconds)
 
 
@@ -260,9 +264,13 @@ def register(
     return point, normal, aligned
 
 
-def with_registration(result: Segmentation, scans: Scans, aligned: Registration) -> Segmentation:
+def with_registration(
+    result: Segmentation, scans: Scans, arranged: Arranged, aligned: Registration
+) -> Segmentation:
     """Return the result with its registration; points left out move with their views too."""
-    out = np.flatnonzero(result.outlier)
+    left_out = np.ones(len(scans), bool)
+    left_out[arranged.row] = False
+    out = np.flatnonzero(left_out)
     if len(out) and scans.view is not None:
         change = aligned.change()[scans.view[out]]
         points = result.points

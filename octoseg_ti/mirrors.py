@@ -1,0 +1,131 @@
+"""Mirror images that look like faces: regions that their view cannot have seen.
+
+A glossy part mirrors the laser line, and the probe takes the second spot for one on the line. Such
+points make smooth sheets of their own, which no rule about neighbours tells from faces. But they
+are seen from one view only, and most lie behind the face that mirrored them, so that their lines of
+sight pass through it. (Those that seem to float in front of the part stay: nothing blocks them.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from octoseg_ti.arrange import Arranged
+from octoseg_ti.device import runtime
+from octoseg_ti.patches import Regions
+from octoseg_ti.stages.grid import Grid
+from octoseg_ti.stages.leaves import leaf_graph, sample_leaves
+from octoseg_ti.stages.sight import blocked_lines
+from octoseg_ti.types import NONE, Registration, Scans
+
+# A region is of one view when so many of its points are, the rest being strays.
+_ONE_VIEW = 0.8
+# Lines of sight that speak for a region, at most; the share of them, and the number, that are
+# blocked where it is a mirror image: of images it is half to all, of faces one in twenty at most.
+_LINES, _SHARE, _FEWEST = 64, 0.25, 4
+# What is this near to a point does not block its line, and so near to a line a point blocks it, in
+# smallest cells: nearly two spacings, and nearly one.
+_CLEAR, _REACH = 1.0, 0.5
+
+
+def probe_positions(
+    scans: Scans, arranged: Arranged, aligned: Registration | None
+) -> np.ndarray | None:
+    """Return where the probe was at every run of points [mm], world frame, shape (S, 3), f64.
+
+    Args:
+        scans: The scans.
+        arranged: Their usable points.
+        aligned: How the views were moved, if they were.
+
+    Returns:
+        The positions, NaN where one is not known; None where none is. One position for a whole view
+        (`Scans.origin`) is none: the probe moved on while it measured.
+    """
+    if scans.stripe_origin is None or scans.stripe is None or arranged.start is None:
+        return None
+    first = arranged.start[:-1]
+    place: np.ndarray = scans.stripe_origin[scans.stripe[arranged.row[first]]]
+    if aligned is not None:
+        change = aligned.change()[arranged.view[first]]
+        place = np.einsum("nij,nj->ni", change[:, :3, :3], place) + change[:, :3, 3]
+    return place if np.isfinite(place).all(axis=1).any() else None
+
+
+def without_mirror_images(
+    grid: Grid, leaves: np.ndarray, found: Regions, arranged: Arranged, probe: np.ndarray
+) -> Regions:
+    """Return the regions without those that are mirror images; their points have no label.
+
+    Args:
+        grid: The sparse grid.
+        leaves: The nodes that are leaves, in Morton order, shape (C,).
+        found: The regions.
+        arranged: The points that went into the grid, with their runs.
+        probe: Where the probe was at every run [mm], world frame, shape (S, 3); NaN = not known.
+    """
+    assert arranged.run is not None
+    order = runtime.download(grid.order)
+    gone = _mirrored(grid, leaves, found, arranged.view[order], arranged.run, order, probe)
+    if not gone.any():
+        return found
+    number = np.full(found.count + 1, NONE, np.int32)
+    kept = np.flatnonzero(~gone)
+    number[kept] = np.arange(len(kept), dtype=np.int32)
+    return replace(
+        found,
+        label=number[found.label],
+        cell_label=number[found.cell_label],
+        count=len(kept),
+        surface=None if found.surface is None else found.surface[kept],
+        mirrored=np.append(gone, False)[found.label],
+    )
+
+
+def _mirrored(
+    grid: Grid,
+    leaves: np.ndarray,
+    found: Regions,
+    view: np.ndarray,
+    run: np.ndarray,
+    order: np.ndarray,
+    probe: np.ndarray,
+) -> np.ndarray:
+    """Say of every region whether it is a mirror image, shape (K,), bool; ``view`` is sorted."""
+    label, regions = found.label, found.count
+    there = np.flatnonzero(label >= 0)
+    views = int(view.max()) + 1
+    seen = np.bincount(label[there].astype(np.int64) * views + view[there], None, regions * views)
+    seen = seen.reshape(regions, views)
+    size = seen.sum(axis=1)
+    # Nothing larger blocks the largest region.
+    asked = (seen.max(axis=1, initial=0) >= _ONE_VIEW * size) & (size < size.max(initial=0))
+    if not asked.any():
+        return asked
+    graph = found.graph or leaf_graph(grid, leaves.astype(np.int32), found.touching)
+    rest = np.where(np.append(asked, False)[label], NONE, 0).astype(np.int32)
+    chosen = sample_leaves(grid, graph, 1, label=rest).index
+    chosen = chosen[np.isfinite(probe[run[order[chosen]]]).all(axis=1)]
+    own = label[chosen]
+    # A few of every region, evenly.
+    rising = np.argsort(own, kind="stable")
+    count = np.bincount(own, minlength=regions)
+    rank = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
+    few = rank % np.maximum(1, -(-count // _LINES))[own[rising]] == 0
+    chosen = chosen[rising[few]]
+    own = label[chosen]
+    finest = grid.size / 2.0**grid.depth
+    blocked = blocked_lines(
+        grid,
+        probe[run[order[chosen]]] - grid.corner,
+        runtime.download(grid.point)[chosen],
+        size[own],
+        np.append(size, 0)[label],
+        clear=_CLEAR * finest,
+        reach=_REACH * finest,
+    )
+    lines = np.bincount(own, minlength=regions)
+    against = np.bincount(own[blocked], minlength=regions)
+    return np.asarray((against >= _FEWEST) & (against >= _SHARE * lines))
