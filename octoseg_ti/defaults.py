@@ -53,7 +53,9 @@ from it, and face anywhere would: where positions are exact they tell by themsel
 narrow faces are those of their neighbourhood."""
 PROOF = 30.0
 """How sure a surface has to be, as a logarithm: of so many surfaces through a few points each,
-tried anywhere, hardly one has the other points that it needs by chance."""
+tried anywhere, hardly one has the other points that it needs by chance. Where views are apart by
+more than the noise, chance does not tell: the points of a view share an error, and agree on what is
+not there."""
 WINDOW = 6.0
 """A point lies on a surface by chance when it is within this many noises, both sides together,
 of all places a spacing apart."""
@@ -142,7 +144,7 @@ def derive(params: Params, measured: Measurement) -> Params:
         surfaces = replace(surfaces, turn=turn)
     if surfaces.min_points is None:
         fewest = regions.min_points
-        if exact > WINDOW:
+        if exact > WINDOW and measured.view_noise <= measured.noise:
             # The more each point tells, the fewer prove a surface.
             fewest = min(fewest, FREEDOM + math.ceil(PROOF / math.log(exact / WINDOW)))
         surfaces = replace(surfaces, min_points=fewest)

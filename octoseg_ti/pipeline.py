@@ -342,9 +342,9 @@ def explain_regions(
         return measured, params, found
     scatter = surface_noise(grid, leaves, found.group[leaves], view)
     if scatter is not None:
-        measured = replace(measured, surface_noise=scatter)
+        measured = replace(measured, surface_noise=scatter[0], view_noise=scatter[1])
         if curved:
-            measured = replace(measured, noise=min(measured.noise, scatter))
+            measured = replace(measured, noise=min(measured.noise, scatter[0]))
     params = derive(replace(params, surfaces=asked), measured)
     return measured, params, fit_surfaces(grid, leaves, found, params)
 

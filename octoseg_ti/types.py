@@ -193,6 +193,9 @@ class Measurement:
     surface_noise: float = 0.0
     """Estimated standard deviation of points about the smooth surface through their neighbourhood
     [mm]: noise, and what neighbours share of it; 0 = not measured."""
+    view_noise: float = 0.0
+    """... of the views from the surfaces that they share [mm], a part of the surface noise: errors
+    of the poses, which all points of a view have in common; 0 = the views meet, or not measured."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -77,6 +77,14 @@ def test_a_patch_is_a_square_of_cells() -> None:
     assert derive(Params(), CLEAN).regions.min_points == round(area / (0.2 * 0.5))
 
 
+def test_views_that_are_apart_prove_no_narrow_faces() -> None:
+    few = derive(Params(), CLEAN)
+    assert few.surfaces.min_points is not None and few.regions.min_points is not None
+    assert few.surfaces.min_points < few.regions.min_points
+    apart = derive(Params(), replace(CLEAN, view_noise=2.0 * CLEAN.noise))
+    assert apart.surfaces.min_points == apart.regions.min_points == few.regions.min_points
+
+
 def test_nothing_measured_gives_finite_values() -> None:
     nothing = Measurement(spacing_along=0.0, spacing_across=0.0, noise=0.0, normal_noise=0.0)
     params = derive(Params(), nothing)

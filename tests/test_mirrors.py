@@ -91,8 +91,8 @@ def test_the_block_of_the_paper_as_an_old_probe_sees_it(planned: bool) -> None:
         views = plan_views(part, scanner, overlap=0.3, count=4)
     scans, truth = simulate(part, replace(scanner, views=views), seed=0)
     scores = evaluate(segment(scans), truth)
-    assert scores.regions.on_unknown == 0
-    if planned:
-        assert scores.artefacts is not None and scores.artefacts.classes["spike"][1] > 0.8
-    else:
-        assert scores.regions.correct == scores.regions.patches == scores.regions.regions
+    regions = scores.regions
+    assert regions.correct == regions.patches == regions.regions
+    assert scores.artefacts is not None
+    if planned:  # the others see hardly any images
+        assert scores.artefacts.classes["spike"][1] > 0.8

@@ -40,8 +40,10 @@ _CHANCE = 0.3
 
 def surface_noise(
     grid: Grid, leaves: np.ndarray, group: np.ndarray, view: np.ndarray
-) -> float | None:
+) -> tuple[float, float] | None:
     """Return the standard deviation of points about the surface through their neighbourhood [mm].
+
+    With it comes the part of it by which views are apart [mm], 0 where they meet.
 
     Args:
         grid: The sparse grid: points that follow one another in Morton order are near each other.
@@ -50,7 +52,7 @@ def surface_noise(
         view: View of every point, in the order in which they went into the grid, shape (n,), i32.
 
     Returns:
-        The deviation; None where no region is large enough to tell.
+        Both deviations; None where no region is large enough to tell.
     """
     key = runtime.download(grid.key)
     region = np.repeat(group, grid.holds[leaves])
@@ -79,8 +81,9 @@ def surface_noise(
     rms = _residuals(point, normal, np.append(begin, len(index)))
     seen = view[runtime.download(grid.order)[index[order]]]
     within, apart = _by_view(point, normal, seen, np.repeat(np.arange(len(count)), count), rms)
-    both = float(np.hypot(_typical(within), apart))
-    return max(_typical(rms), both) if apart > _CHANCE * _typical(within) else _typical(rms)
+    if apart <= _CHANCE * _typical(within):
+        return _typical(rms), 0.0
+    return max(_typical(rms), float(np.hypot(_typical(within), apart))), apart
 
 
 def _typical(rms: np.ndarray) -> float:

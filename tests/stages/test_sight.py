@@ -44,7 +44,7 @@ def test_equals_the_reference(seed: int) -> None:
 
 
 def floors() -> tuple[Grid, np.ndarray]:
-    """Return a large floor at z = 5 with a hole, and half of it at z = 0; their points weigh 2, 1."""
+    """Return a floor at z = 5 with a hole, and half of it at z = 0; points weigh 2 and 1."""
     x, y = np.meshgrid(np.arange(0.0, 20.0, 0.25), np.arange(0.0, 20.0, 0.25))
     upper = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 5.0)])
     lower = upper[upper[:, 0] < 10.0] * [1.0, 1.0, 0.0]
