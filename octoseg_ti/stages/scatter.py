@@ -18,7 +18,7 @@ import numpy as np
 
 from octoseg_ti.device import runtime
 from octoseg_ti.fitting.primitives import FREEDOM, fit_all
-from octoseg_ti.fitting.quadrics import QUADRIC_FREEDOM, fit_quadrics
+from octoseg_ti.fitting.quadrics import QUADRIC_FREEDOM, Quadrics, fit_quadrics
 from octoseg_ti.stages.grid import Grid
 
 # Neighbourhoods, and the points of each.
@@ -78,12 +78,15 @@ def surface_noise(
     # In an order that has nothing to do with that of the input.
     order = np.lexsort((*point.T, np.repeat(np.arange(len(count)), count)))
     point, normal = point[order], runtime.download(grid.normal)[index[order]]
-    rms = _residuals(point, normal, np.append(begin, len(index)))
+    rms, bent = _residuals(point, normal, np.append(begin, len(index)))
     seen = view[runtime.download(grid.order)[index[order]]]
-    within, apart = _by_view(point, normal, seen, np.repeat(np.arange(len(count)), count), rms)
-    if apart <= _CHANCE * _typical(within):
+    owner = np.repeat(np.arange(len(count)), count)
+    # Where a quadric does, quadrics do for the views too; half of the places tell enough.
+    asked = ~bent[owner] & (owner % 2 == 0)
+    within, apart = _by_view(point[asked], normal[asked], seen[asked], owner[asked], rms)
+    if apart <= _CHANCE * within:
         return _typical(rms), 0.0
-    return max(_typical(rms), float(np.hypot(_typical(within), apart))), apart
+    return max(_typical(rms), float(np.hypot(within, apart))), apart
 
 
 def _typical(rms: np.ndarray) -> float:
@@ -94,45 +97,55 @@ def _typical(rms: np.ndarray) -> float:
 
 def _by_view(
     point: np.ndarray, normal: np.ndarray, view: np.ndarray, group: np.ndarray, rms: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Return how far points scatter about surfaces of their views, and how far views are apart.
+) -> tuple[float, float]:
+    """Return how far points scatter about quadrics of their views, and how far views are apart.
 
     Args:
-        point: Points of the groups, one group after the other [mm], shape (S, 3).
+        point: Points of some groups, one group after the other [mm], shape (S, 3).
         normal: Their normals, shape (S, 3).
         view: Their views, shape (S,).
         group: Their groups, rising, shape (S,).
         rms: What one surface leaves of every group [mm], shape (G,).
 
     Returns:
-        What the surfaces of its views leave of every group [mm], shape (G,); and the deviation of
-        the views from the surfaces that they share [mm], 0 where too few meet.
+        What quadrics of the views leave of a usual group in which they meet, and the deviation of
+        the views from the surface that they share [mm]; both 0 where too few meet.
     """
+    if len(view) == 0 or np.all(view == view[0]):
+        return 0.0, 0.0
     order = np.lexsort((view, group))
     piece = np.cumsum(np.diff(group[order] * (view.max() + 1) + view[order], prepend=-1) > 0) - 1
     count = np.bincount(piece)
     name = group[order][np.cumsum(count) - count]
     large = count >= _FEWEST
     large &= np.bincount(name[large], minlength=len(rms))[name] > 1
-    if not large.any():
-        return rms, 0.0
+    if np.count_nonzero(large) < 2 * _MEETINGS:
+        return 0.0, 0.0
     rows = order[large[piece]]
-    start = np.concatenate([[0], np.cumsum(count[large])]).astype(np.int32)
-    own = _residuals(point[rows], normal[rows], start)
-    number = np.bincount(name[large], count[large], len(rms))
+    name, count = name[large], count[large]
+    start = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
+    square = count * _of_quadrics(fit_quadrics(point[rows], normal[rows], start), count) ** 2
+    # In an order that has nothing to do with the numbers of the views.
+    rising = np.lexsort((square, name))
+    number = np.bincount(name, count, len(rms))
     meet = number > 0
-    within = rms.copy()
-    square = np.bincount(name[large], count[large] * own**2, len(rms))
-    within[meet] = np.sqrt(square[meet] / number[meet])
-    meet &= within <= _EDGES * np.quantile(within, _CALM)
-    if np.count_nonzero(meet) < _MEETINGS:
-        return within, 0.0
-    apart = np.sqrt(np.maximum(rms[meet] ** 2 - within[meet] ** 2, 0.0))
-    return within, float(np.quantile(apart, _APART))
+    within = np.sqrt(np.bincount(name[rising], square[rising], len(rms))[meet] / number[meet])
+    plain = within <= _EDGES * np.quantile(within, _CALM)
+    if np.count_nonzero(plain) < _MEETINGS:
+        return 0.0, 0.0
+    apart = np.sqrt(np.maximum(rms[meet][plain] ** 2 - within[plain] ** 2, 0.0))
+    return _typical(within), float(np.quantile(apart, _APART))
 
 
-def _residuals(point: np.ndarray, normal: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return what the surface through every group leaves [mm], shape (G,).
+def _of_quadrics(found: Quadrics, count: np.ndarray) -> np.ndarray:
+    """Return what quadrics leave [mm], had they no freedom, shape (G,)."""
+    return np.asarray(found.rms[:, 1] * np.sqrt(count / np.maximum(count - QUADRIC_FREEDOM, 1)))
+
+
+def _residuals(
+    point: np.ndarray, normal: np.ndarray, start: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what the surface through every group leaves [mm], and whether it is bent, shapes (G,).
 
     Args:
         point: Points of the groups, one group after the other [mm], shape (S, 3).
@@ -141,7 +154,7 @@ def _residuals(point: np.ndarray, normal: np.ndarray, start: np.ndarray) -> np.n
     """
     count = np.diff(start)
     found = fit_quadrics(point, normal, start)
-    rms = found.rms[:, 1] * np.sqrt(count / np.maximum(count - QUADRIC_FREEDOM, 1))
+    rms = _of_quadrics(found, count)
     bent = (found.bend > _BEND) & (rms <= _EDGE * np.quantile(rms, _CALM))
     if bent.any():
         mine = np.repeat(bent, count)
@@ -150,4 +163,4 @@ def _residuals(point: np.ndarray, normal: np.ndarray, start: np.ndarray) -> np.n
         spare = count[bent, None] / (count[bent, None] - FREEDOM[None, :])
         best = np.where(np.isfinite(fit.rms), fit.rms * np.sqrt(spare), np.inf).min(axis=1)
         rms[bent] = np.minimum(rms[bent], best)
-    return rms
+    return rms, bent
