@@ -25,6 +25,7 @@ import numpy as np
 import octoseg_ti
 from octoseg_ti import Scans, SurfaceKind, segment
 from octoseg_ti.device.profiling import Trace
+from octoseg_ti.types import EdgeClass
 
 # The harness knows four kinds of surface.
 _TYPES = {
@@ -65,10 +66,15 @@ def answer(given: Path, out: Path) -> None:
     compiled = time.perf_counter() - began
     trace = Trace()
     result = segment(scans, trace=trace)
-    result.labels.tofile(out / "labels.i32")
+    labels = result.labels.copy()
+    if result.fillets is not None:
+        # The truth of the harness knows no fillets; which patches are strips of one is told.
+        strips = np.flatnonzero(result.fillets.strip >= 0)
+        labels[np.isin(labels, strips) | (result.edge == EdgeClass.FILLET)] = -1
+    labels.tofile(out / "labels.i32")
     result.normals.astype(np.float32).tofile(out / "normals.f32")
     types = np.array([_TYPES.get(SurfaceKind(int(k)), -1) for k in result.kind] + [-1], np.int32)
-    types[result.labels].tofile(out / "types.i32")
+    types[labels].tofile(out / "types.i32")
     stages = [["jit", "first run", compiled]]
     for name, seconds in trace.seconds.items():
         stages.append(["normals" if name in _NORMALS else "segment", name, seconds])
