@@ -62,7 +62,7 @@ _REFIT = 300
 _INNER = 40
 # A surface is given up when its neighbours explain its points with this mean square, in noises.
 _EXPLAINED = 2.0
-_MERGES = 3
+_MERGES = 8
 # By how much the cost of a surface found late must be lower, in squares of noises.
 _HANDICAP = 2.0
 # A free form has at least this many times the points of the smallest patch.
