@@ -1,0 +1,141 @@
+"""Rims: sharp edges of which only one face was scanned.
+
+The bottom rim of a part, whose underside no view sees; the top of a step seen from above only.
+Where a face ends at an open border and what the probe saw beyond shows that it goes on no further,
+there is an edge. The rim of a shadow is none, nor is the end of the field of view.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from octoseg_ti.arrange import Arranged
+from octoseg_ti.device.surfaces import evaluate_surfaces
+from octoseg_ti.stages.normals import stripe_axes
+from octoseg_ti.stages.rims import (
+    BEHIND,
+    ENDED,
+    HIDDEN,
+    PASSED,
+    Lines,
+    look_beyond,
+    open_sides,
+)
+from octoseg_ti.stages.surroundings import FREE, SECTORS, Surroundings
+from octoseg_ti.types import EdgeClass, Scans
+from octoseg_ti.zones import CAP, EDGE, Search
+
+_GAP = 3.0  # neighbours in scan order are at most so many spacings apart
+_AROUND = 2.5  # ... and neighbours among all points
+_OFF = 0.06  # what lies so many spacings off a face is behind it, plus a cap of noise
+# The edge lies up to a spacing beyond the last points, half of one on average. On its other side a
+# sector is as wide, so the mean would do; but points on the rim of two stripes count half.
+_INSIDE = 0.75
+# A face ends straight when on the way outwards it turns by less than this share of its turn aside.
+_STRAIGHT = 0.3
+_LIMIT = 3.0  # a stripe that ends so many lanes from the longest of its view may have been cut
+_CUT = 0.5  # stripes run across the whole field of view when this share of them ends at its limit
+
+
+def scan_lines(scans: Scans, arranged: Arranged, point: np.ndarray, order: np.ndarray) -> Lines:
+    """Return the points in scan order, with the ray that saw each.
+
+    Args:
+        scans: The input.
+        arranged: Its usable points, on stripes.
+        point: Their positions in the world [mm], shape (n, 3), f64.
+        order: Place in scan order of every sorted point, shape (n,).
+    """
+    start, run = arranged.start, arranged.run
+    assert start is not None and run is not None
+    first, last = start[:-1], start[1:] - 1
+    view = arranged.view[first]
+    source = None
+    if scans.stripe_origin is not None and scans.stripe is not None:
+        source = np.asarray(scans.stripe_origin, np.float64)[scans.stripe[arranged.row[first]]]
+    elif scans.origin is not None:
+        source = np.asarray(scans.origin, np.float64)[view]
+    if source is not None and not np.isfinite(source).all():
+        source = None
+    views = int(view.max(initial=0)) + 1
+    if scans.column is not None:
+        lane = scans.column[arranged.row].astype(np.float64)
+    else:
+        axis = stripe_axes(point, start, view[run], views)[view[run]]
+        away = point if source is None else point - source[run]
+        lane = np.einsum("ij,ij->i", away, axis)
+        if source is not None:
+            lane /= np.maximum(np.linalg.norm(away, axis=1), 1e-12)
+        step = np.diff(lane)[run[1:] == run[:-1]]
+        lane /= max(float(np.median(np.abs(step))) if len(step) else 1.0, 1e-12)
+    rise = np.bincount(view, lane[last] - lane[first], views)
+    lane *= np.where(rise < 0.0, -1.0, 1.0)[view][run]
+    return Lines(point, start, run, view, lane, source, order)
+
+
+def mark_rims(search: Search, lines: Lines, edge: np.ndarray) -> None:
+    """Mark the points at rims as sharp, in place, where they are at no other edge."""
+    label, spacing = search.label, search.spacing
+    asked = (edge == int(EdgeClass.NONE)) & (label >= 0)
+    asked[asked] = search.analytic[label[asked]]
+    in_order = np.zeros(len(label), bool)
+    in_order[lines.order] = asked
+    side = open_sides(lines, in_order, _GAP * spacing)[lines.order]
+    point = np.flatnonzero(side > 0)
+    leaves = search.leaves
+    leaf = np.searchsorted(leaves.first, point, side="right") - 1
+    around = Surroundings(search.device[0], leaves, search.box, _AROUND * spacing)
+    outward, free = around.free_sectors(search.device[1], point, leaf, _AROUND * spacing)
+    there = np.flatnonzero((free >= FREE) & (free < SECTORS))
+    point, leaf, outward = point[there], leaf[there], outward[there]
+    field, cut = fields(lines)
+    found = look_beyond(
+        lines, field, lines.order[point], side[point], search.normals[point], outward,
+        gap=_GAP * spacing, off=_OFF * spacing + CAP * search.noise,
+    )  # fmt: skip
+    here = lines.view[lines.run[lines.order[point]]]
+    real = (found & (ENDED | BEHIND)) > 0
+    real |= ((found & PASSED) > 0) & ~cut[here]
+    real &= (found & HIDDEN) == 0
+    real[real] = ends_straight(search, point[real], outward[real], _GAP * spacing)
+    near = around.near(label, point[real], leaf[real], (EDGE - _INSIDE) * spacing)
+    edge[near & (edge == int(EdgeClass.NONE))] = int(EdgeClass.SHARP)
+
+
+def fields(lines: Lines) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the stripes of every view end amid its field of view, and where none does.
+
+    Returns:
+        Lowest and highest lane of such an end, shape (V, 2); views whose stripes run from one limit
+        to the other, so that their first and last stripe may as well have cut the part, (V,) bool.
+    """
+    low, high = lines.lane[lines.start[:-1]], lines.lane[lines.start[1:] - 1]
+    views = int(lines.view.max(initial=0)) + 1
+    field, cut = np.zeros((views, 2)), np.zeros(views, bool)
+    for v in range(views):
+        mine = lines.view == v
+        if mine.any():
+            field[v] = low[mine].min() + _LIMIT, high[mine].max() - _LIMIT
+            ends = (low[mine] <= field[v, 0]).mean(), (high[mine] >= field[v, 1]).mean()
+            cut[v] = min(ends) >= _CUT
+    return field, cut
+
+
+def ends_straight(search: Search, point: np.ndarray, outward: np.ndarray, way: float) -> np.ndarray:
+    """Say which faces would go on without turning away from the probe, (E,) bool.
+
+    A face that does may end because the probe sees it too flat from the side.
+    """
+    label = search.label[point]
+    kind, parameters = search.table[:, 8].astype(np.int32), search.table[:, :8]
+    at = search.points[point]
+    aside = np.cross(outward, search.normals[point])
+
+    def normal_at(place: np.ndarray) -> np.ndarray:
+        _, normal = evaluate_surfaces(place, label, kind, parameters)
+        return np.nan_to_num(normal)
+
+    here = normal_at(at)
+    turn = [np.linalg.norm(normal_at(at + way * to) - here, axis=1) for to in (outward, aside)]
+    straight: np.ndarray = turn[0] <= _STRAIGHT * turn[1] + 1e-9
+    return straight

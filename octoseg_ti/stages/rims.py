@@ -1,0 +1,276 @@
+"""Where a scanned face ends although nothing was measured beside it, and what the probe saw there.
+
+Such a border is an edge of the part, or the rim of a shadow, or the end of the field of view. In
+scan order a border is a point whose stripe breaks off, or beside which the next stripe has no point
+at the same ray; among the points of all views it is one with a wide sector around it free of
+points. What lies beyond tells which it is: a ray that went on to something behind the plane of the
+face crossed that plane, so the face is not there; where something stands in front of the plane, or
+lies in it, the face may go on in its shadow. (Occluding and occluded contours of range images:
+Besl & Jain 1988; Fisher 1989.)
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.device.linalg import row, vec3
+from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, ti
+
+NEXT, BEFORE, UP, DOWN = 1, 2, 4, 8
+"""Sides of a point in scan order that may be open: along its stripe, and towards the next stripe
+or the one before."""
+
+ENDED, BEHIND, PASSED, HIDDEN = 1, 2, 4, 8
+"""What is beyond an open side: no further point, amid the field of view; something behind the
+plane of the face; no further stripe; something in the plane or in front of it, or the end of the
+field of view."""
+
+_LANES = 2.0  # a point of another stripe is on the same ray within so many lanes
+_TOWARDS = 0.3  # a side is open towards the free sector within the angle of this cosine
+
+
+class Lines(NamedTuple):
+    """Points in scan order, ``S`` stripes."""
+
+    points: np.ndarray
+    """Positions [mm], shape (n, 3), f64."""
+    start: np.ndarray
+    """First point of every stripe, and n at the end, shape (S + 1,), i32."""
+    run: np.ndarray
+    """Stripe of every point, shape (n,), i32."""
+    view: np.ndarray
+    """View of every stripe, shape (S,), i32."""
+    lane: np.ndarray
+    """Ray of every point, rising along its stripe, about 1 from point to point, shape (n,), f64."""
+    source: np.ndarray | None
+    """Probe at every stripe [mm], shape (S, 3), f64; None = not known."""
+    order: np.ndarray
+    """Place in scan order of every sorted point, shape (n,)."""
+
+
+@ti.func
+def _on_ray(
+    lane_in: ti.template(), start_in: ti.template(), view_in: ti.template(), s: ti.i32, t: ti.i32,
+    stripes: ti.i32, lane: ti.f64,
+) -> ti.i32:  # fmt: skip
+    """Return the point of stripe t on a ray, -1 if there is none or t belongs to another view."""
+    found = -1
+    if t >= 0 and t < stripes and view_in[ti.max(0, ti.min(t, stripes - 1))] == view_in[s]:
+        lo = start_in[t]
+        hi = start_in[t + 1] - 1
+        while lo < hi:
+            middle = (lo + hi) // 2
+            if lane_in[middle] < lane:
+                lo = middle + 1
+            else:
+                hi = middle
+        if lo > start_in[t] and lane - lane_in[lo - 1] < ti.abs(lane_in[lo] - lane):
+            lo -= 1
+        if ti.abs(lane_in[lo] - lane) <= _LANES:
+            found = lo
+    return found
+
+
+@ti.func
+def _close(point_in: ti.template(), i: ti.i32, j: ti.i32, gap: ti.f64) -> ti.i32:
+    """Say whether j is a point, and near point i."""
+    near = 0
+    if j >= 0:
+        near = ti.cast((row(point_in, j) - row(point_in, i)).norm_sqr() <= gap * gap, ti.i32)
+    return near
+
+
+@ti.func
+def _beside(
+    point_in: ti.template(), lane_in: ti.template(), i: ti.i32, j: ti.i32, hi: ti.i32, gap: ti.f64
+):  # fmt: skip
+    """Return (the point of another stripe nearest to the ray of point i, whether it is near i).
+
+    The search goes on from point j to the end of that stripe, hi.
+    """
+    lane = lane_in[i]
+    while j + 1 < hi and ti.abs(lane_in[ti.min(j + 1, hi - 1)] - lane) <= ti.abs(lane_in[j] - lane):
+        j += 1
+    near = 0
+    if j < hi and ti.abs(lane_in[j] - lane) <= _LANES:
+        near = _close(point_in, i, j, gap)
+    return j, near
+
+
+@ti.kernel
+def _open_sides(
+    gap: ti.f64,
+    # In:
+    asked_in: I32Array,
+    point_in: F64Rows,
+    start_in: I32Array,
+    view_in: I32Array,
+    lane_in: F64Array,
+    # Out:
+    side_out: I32Array,
+):
+    """Write on which sides a point has no neighbour, though it has one on the other side."""
+    for s in view_in:
+        last = view_in.shape[0] - 1
+        up = start_in[s + 1]
+        up_end = up
+        if s < last and view_in[ti.min(s + 1, last)] == view_in[s]:
+            up_end = start_in[s + 2]
+        down = start_in[ti.max(s - 1, 0)]
+        down_end = down
+        if s > 0 and view_in[ti.max(s - 1, 0)] == view_in[s]:
+            down_end = start_in[s]
+        for i in range(start_in[s], start_in[s + 1]):
+            side = 0
+            if asked_in[i] == 1:
+                ahead = _close(point_in, i, ti.select(i + 1 < start_in[s + 1], i + 1, -1), gap)
+                back = _close(point_in, i, ti.select(i > start_in[s], i - 1, -1), gap)
+                if ahead != back:
+                    side += ti.select(back == 1, NEXT, BEFORE)
+                next_near = 0
+                last_near = 0
+                up, next_near = _beside(point_in, lane_in, i, up, up_end, gap)
+                down, last_near = _beside(point_in, lane_in, i, down, down_end, gap)
+                if next_near != last_near:
+                    side += ti.select(last_near == 1, UP, DOWN)
+            side_out[i] = side
+
+
+@ti.func
+def _beyond(p: vec3, q: vec3, n: vec3, away: vec3, gap: ti.f64, off: ti.f64) -> ti.i32:
+    """Return what the next point q says about the face that ends at p.
+
+    Args:
+        p: The last point of the face.
+        q: The next one.
+        n: The normal of the face.
+        away: Where the probe is, seen from q.
+        gap: The plane of the face has to be crossed this close to p [mm].
+        off: q is off that plane when it is so far from it [mm].
+    """
+    found = HIDDEN
+    height = (q - p).dot(n)
+    fall = away.dot(n)
+    if height < -off and fall > 0.0:
+        crossing = q - (height / fall) * away
+        if (crossing - p).norm_sqr() <= gap * gap:
+            found = BEHIND
+    return found
+
+
+@ti.kernel
+def _look_beyond(
+    entries: ti.i32,
+    known: ti.i32,
+    # In:
+    limit_in: F64Array,
+    point_in: F64Rows,
+    start_in: I32Array,
+    view_in: I32Array,
+    lane_in: F64Array,
+    source_in: F64Rows,
+    range_in: F64Rows,
+    entry_in: I32Rows,
+    border_in: F64Rows,
+    # Out:
+    found_out: I32Array,
+):
+    """Write what is beyond the open sides of border points that agree with their free sector."""
+    for e in range(entries):
+        i = entry_in[e, 0]
+        s = entry_in[e, 1]
+        side = entry_in[e, 2]
+        p = row(point_in, i)
+        n = vec3(border_in[e, 0], border_in[e, 1], border_in[e, 2])
+        outward = vec3(border_in[e, 3], border_in[e, 4], border_in[e, 5])
+        stripes = view_in.shape[0]
+        found = 0
+        for bit in range(4):
+            if (side >> bit) & 1 == 1:
+                step = 1 - 2 * (bit % 2)
+                q = i + step
+                inner = i - step
+                if bit >= 2:
+                    inner = _on_ray(lane_in, start_in, view_in, s, s - step, stripes, lane_in[i])
+                    t = s + step
+                    q = -1
+                    while q < 0 and t >= 0 and t < stripes and view_in[t] == view_in[s]:
+                        q = _on_ray(lane_in, start_in, view_in, s, t, stripes, lane_in[i])
+                        t += step
+                elif q < start_in[s] or q >= start_in[s + 1]:
+                    q = -1
+                way = p - row(point_in, inner)
+                if way.dot(outward) >= _TOWARDS * way.norm():
+                    if q >= 0:
+                        away = n
+                        if known == 1:
+                            away = row(source_in, s) - row(point_in, q)
+                        found |= _beyond(p, row(point_in, q), n, away, limit_in[0], limit_in[1])
+                    elif bit >= 2:
+                        t = ti.max(0, ti.min(s + step, stripes - 1))
+                        more = t == s + step and view_in[t] == view_in[s]
+                        found |= ti.select(more, ENDED, PASSED)
+                    else:
+                        v = view_in[s]
+                        amid = lane_in[i] > range_in[v, 0] and lane_in[i] < range_in[v, 1]
+                        found |= ti.select(amid, ENDED, HIDDEN)
+        found_out[e] = found
+
+
+def open_sides(lines: Lines, asked: np.ndarray, gap: float) -> np.ndarray:
+    """Return on which sides points have no neighbour in scan order, shape (n,), i32 of bits.
+
+    Args:
+        lines: The points in scan order.
+        asked: Which of them are looked at, shape (n,), bool.
+        gap: Neighbours are at most so far apart [mm].
+    """
+    runtime.ensure_started()
+    side = runtime.empty(len(lines.points), np.int32)
+    _open_sides(
+        gap, runtime.upload(asked.astype(np.int32)), runtime.upload(lines.points),
+        runtime.upload(lines.start), runtime.upload(lines.view), runtime.upload(lines.lane), side,
+    )  # fmt: skip
+    return runtime.download(side)
+
+
+def look_beyond(
+    lines: Lines,
+    field: np.ndarray,
+    point: np.ndarray,
+    side: np.ndarray,
+    normal: np.ndarray,
+    outward: np.ndarray,
+    *,
+    gap: float,
+    off: float,
+) -> np.ndarray:
+    """Return what was seen beyond border points, shape (E,), i32 of bits.
+
+    Args:
+        lines: The points in scan order.
+        field: Lanes between which a stripe that ends has ended amid the field of view, for every
+            view, shape (V, 2).
+        point: Border points, places in scan order, shape (E,).
+        side: Their open sides, shape (E,).
+        normal: Their normals, shape (E, 3).
+        outward: Direction in which no points lie, shape (E, 3).
+        gap: The ray to a point behind a face crosses the plane of the face so close [mm].
+        off: ... and the point is so far behind it [mm].
+    """
+    runtime.ensure_started()
+    entries = len(point)
+    if entries == 0:
+        return np.zeros(0, np.int32)
+    source = np.zeros((1, 3)) if lines.source is None else lines.source
+    found = runtime.empty(entries, np.int32)
+    _look_beyond(
+        entries, int(lines.source is not None), runtime.upload(np.array([gap, off])),
+        runtime.upload(lines.points), runtime.upload(lines.start), runtime.upload(lines.view),
+        runtime.upload(lines.lane), runtime.upload(source),
+        runtime.upload(field.astype(np.float64)),
+        runtime.upload(np.stack([point, lines.run[point], side], axis=1).astype(np.int32)),
+        runtime.upload(np.concatenate([normal, outward], axis=1)), found,
+    )  # fmt: skip
+    return runtime.download(found)
