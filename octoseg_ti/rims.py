@@ -89,13 +89,14 @@ def mark_rims(search: Search, lines: Lines, edge: np.ndarray) -> None:
     there = np.flatnonzero((free >= FREE) & (free < SECTORS))
     point, leaf, outward = point[there], leaf[there], outward[there]
     field, cut = fields(lines)
+    place = lines.order[point]
+    normal = normals_of(search, point, search.points[point])
     found = look_beyond(
-        lines, field, lines.order[point], side[point], search.normals[point], outward,
+        lines, field, place, side[point], normal, outward,
         gap=_GAP * spacing, off=_OFF * spacing + CAP * search.noise,
     )  # fmt: skip
-    here = lines.view[lines.run[lines.order[point]]]
     real = (found & (ENDED | BEHIND)) > 0
-    real |= ((found & PASSED) > 0) & ~cut[here]
+    real |= ((found & PASSED) > 0) & ~cut[lines.view[lines.run[place]]]
     real &= (found & HIDDEN) == 0
     real[real] = ends_straight(search, point[real], outward[real], _GAP * spacing)
     near = around.near(label, point[real], leaf[real], (EDGE - _INSIDE) * spacing)
@@ -121,21 +122,25 @@ def fields(lines: Lines) -> tuple[np.ndarray, np.ndarray]:
     return field, cut
 
 
+def normals_of(search: Search, point: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Return the normals of the surfaces of some points, at other places, shape (E, 3)."""
+    label = search.label[point]
+    kind, parameters = search.table[label, 8].astype(np.int32), search.table[label, :8]
+    _, normal = evaluate_surfaces(place, np.arange(len(point)), kind, parameters)
+    outward: np.ndarray = np.nan_to_num(normal) * search.table[label, 9:]
+    return outward
+
+
 def ends_straight(search: Search, point: np.ndarray, outward: np.ndarray, way: float) -> np.ndarray:
     """Say which faces would go on without turning away from the probe, (E,) bool.
 
     A face that does may end because the probe sees it too flat from the side.
     """
-    label = search.label[point]
-    kind, parameters = search.table[:, 8].astype(np.int32), search.table[:, :8]
     at = search.points[point]
-    aside = np.cross(outward, search.normals[point])
-
-    def normal_at(place: np.ndarray) -> np.ndarray:
-        _, normal = evaluate_surfaces(place, label, kind, parameters)
-        return np.nan_to_num(normal)
-
-    here = normal_at(at)
-    turn = [np.linalg.norm(normal_at(at + way * to) - here, axis=1) for to in (outward, aside)]
+    here = normals_of(search, point, at)
+    turn = [
+        np.linalg.norm(normals_of(search, point, at + way * to) - here, axis=1)
+        for to in (outward, np.cross(outward, here))
+    ]
     straight: np.ndarray = turn[0] <= _STRAIGHT * turn[1] + 1e-9
     return straight

@@ -27,6 +27,7 @@ plane of the face; no further stripe; something in the plane or in front of it, 
 field of view."""
 
 _LANES = 2.0  # a point of another stripe is on the same ray within so many lanes
+_SLOPE = 0.02  # the plane of a face is known so well, far from it
 _TOWARDS = 0.3  # a side is open towards the free sector within the angle of this cosine
 
 
@@ -138,31 +139,93 @@ def _open_sides(
 
 
 @ti.func
-def _beyond(p: vec3, q: vec3, n: vec3, away: vec3, gap: ti.f64, off: ti.f64) -> ti.i32:
-    """Return what the next point q says about the face that ends at p.
+def _crossing(p: vec3, q: vec3, n: vec3, away: vec3, off: ti.f64) -> ti.f64:
+    """Return how far from p the ray to q crossed the plane of p; -1 unless q is behind that plane.
 
     Args:
-        p: The last point of the face.
-        q: The next one.
+        p: The last point of a face.
+        q: A point that was measured beyond it.
         n: The normal of the face.
         away: Where the probe is, seen from q.
-        gap: The plane of the face has to be crossed this close to p [mm].
-        off: q is off that plane when it is so far from it [mm].
+        off: Points are off the plane when they are so far from it [mm].
     """
-    found = HIDDEN
+    found = -1.0
     height = (q - p).dot(n)
     fall = away.dot(n)
-    if height < -off and fall > 0.0:
-        crossing = q - (height / fall) * away
-        if (crossing - p).norm_sqr() <= gap * gap:
+    if height < -off - _SLOPE * (q - p).norm() and fall > 0.0:
+        found = (q - (height / fall) * away - p).norm()
+    return found
+
+
+@ti.func
+def _sight(source_in: ti.template(), s: ti.i32, q: vec3, n: vec3) -> vec3:
+    """Return where the probe is, seen from q on stripe s; where n points if that is not known."""
+    away = n
+    if source_in.shape[0] > s:
+        away = row(source_in, s) - q
+    return away
+
+
+@ti.func
+def _seen_along(
+    point_in: ti.template(), start_in: ti.template(), lane_in: ti.template(),
+    source_in: ti.template(), i: ti.i32, s: ti.i32, step: ti.i32, n: vec3, low: ti.f64,
+    high: ti.f64, gap: ti.f64, off: ti.f64,
+) -> ti.i32:  # fmt: skip
+    """Return what is beyond point i along its stripe s."""
+    found = HIDDEN
+    k = i + step
+    if k >= start_in[s] and k < start_in[s + 1]:
+        q = row(point_in, k)
+        far = _crossing(row(point_in, i), q, n, _sight(source_in, s, q, n), off)
+        if far >= 0.0 and far <= gap:
             found = BEHIND
+    elif lane_in[i] > low and lane_in[i] < high:
+        found = ENDED
+    return found
+
+
+@ti.func
+def _seen_across(
+    point_in: ti.template(), start_in: ti.template(), view_in: ti.template(),
+    lane_in: ti.template(), source_in: ti.template(), i: ti.i32, s: ti.i32, step: ti.i32, n: vec3,
+    gap: ti.f64, off: ti.f64,
+) -> ti.i32:  # fmt: skip
+    """Return what is beyond point i of stripe s, on the same ray of the stripes that follow.
+
+    The camera stands on one of these sides. What is behind the face is often hidden from it by the
+    face itself, for some stripes; what stands in front of the plane of the face may hide the face.
+    """
+    stripes = view_in.shape[0]
+    p = row(point_in, i)
+    t = s + step
+    found = PASSED
+    first = 1
+    while t >= 0 and t < stripes and found != HIDDEN:
+        if view_in[t] != view_in[s]:
+            t = stripes
+        else:
+            if found == PASSED:
+                found = ENDED
+            k = _on_ray(lane_in, start_in, view_in, s, t, stripes, lane_in[i])
+            if k >= 0:
+                q = row(point_in, k)
+                far = _crossing(p, q, n, _sight(source_in, t, q, n), off)
+                if first == 1:
+                    # Without a place of the probe normals may point to the wrong side.
+                    found = ti.select(far >= 0.0 and source_in.shape[0] > t, BEHIND, HIDDEN)
+                    if far >= 0.0 and far <= gap:
+                        found = BEHIND
+                        t = stripes
+                elif (q - p).dot(n) > off + _SLOPE * (q - p).norm():
+                    found = HIDDEN
+                first = 0
+            t += step
     return found
 
 
 @ti.kernel
 def _look_beyond(
-    entries: ti.i32,
-    known: ti.i32,
     # In:
     limit_in: F64Array,
     point_in: F64Rows,
@@ -170,51 +233,40 @@ def _look_beyond(
     view_in: I32Array,
     lane_in: F64Array,
     source_in: F64Rows,
-    range_in: F64Rows,
+    field_in: F64Rows,
     entry_in: I32Rows,
     border_in: F64Rows,
     # Out:
     found_out: I32Array,
 ):
     """Write what is beyond the open sides of border points that agree with their free sector."""
-    for e in range(entries):
+    for e in found_out:
         i = entry_in[e, 0]
         s = entry_in[e, 1]
-        side = entry_in[e, 2]
-        p = row(point_in, i)
+        v = view_in[s]
         n = vec3(border_in[e, 0], border_in[e, 1], border_in[e, 2])
         outward = vec3(border_in[e, 3], border_in[e, 4], border_in[e, 5])
-        stripes = view_in.shape[0]
         found = 0
         for bit in range(4):
-            if (side >> bit) & 1 == 1:
+            if (entry_in[e, 2] >> bit) & 1 == 1:
                 step = 1 - 2 * (bit % 2)
-                q = i + step
                 inner = i - step
                 if bit >= 2:
-                    inner = _on_ray(lane_in, start_in, view_in, s, s - step, stripes, lane_in[i])
-                    t = s + step
-                    q = -1
-                    while q < 0 and t >= 0 and t < stripes and view_in[t] == view_in[s]:
-                        q = _on_ray(lane_in, start_in, view_in, s, t, stripes, lane_in[i])
-                        t += step
-                elif q < start_in[s] or q >= start_in[s + 1]:
-                    q = -1
-                way = p - row(point_in, inner)
-                if way.dot(outward) >= _TOWARDS * way.norm():
-                    if q >= 0:
-                        away = n
-                        if known == 1:
-                            away = row(source_in, s) - row(point_in, q)
-                        found |= _beyond(p, row(point_in, q), n, away, limit_in[0], limit_in[1])
-                    elif bit >= 2:
-                        t = ti.max(0, ti.min(s + step, stripes - 1))
-                        more = t == s + step and view_in[t] == view_in[s]
-                        found |= ti.select(more, ENDED, PASSED)
-                    else:
-                        v = view_in[s]
-                        amid = lane_in[i] > range_in[v, 0] and lane_in[i] < range_in[v, 1]
-                        found |= ti.select(amid, ENDED, HIDDEN)
+                    inner = _on_ray(
+                        lane_in, start_in, view_in, s, s - step, view_in.shape[0], lane_in[i]
+                    )
+                way = row(point_in, i) - row(point_in, inner)
+                towards = way.dot(outward) >= _TOWARDS * way.norm()
+                if towards and bit < 2:
+                    found |= _seen_along(
+                        point_in, start_in, lane_in, source_in, i, s, step, n, field_in[v, 0],
+                        field_in[v, 1], limit_in[0], limit_in[1],
+                    )  # fmt: skip
+                if towards and bit >= 2:
+                    found |= _seen_across(
+                        point_in, start_in, view_in, lane_in, source_in, i, s, step, n,
+                        limit_in[0], limit_in[1],
+                    )  # fmt: skip
         found_out[e] = found
 
 
@@ -254,22 +306,22 @@ def look_beyond(
             view, shape (V, 2).
         point: Border points, places in scan order, shape (E,).
         side: Their open sides, shape (E,).
-        normal: Their normals, shape (E, 3).
+        normal: Normals of the faces there, shape (E, 3).
         outward: Direction in which no points lie, shape (E, 3).
-        gap: The ray to a point behind a face crosses the plane of the face so close [mm].
-        off: ... and the point is so far behind it [mm].
+        gap: The ray to a point behind a face, on the same stripe, crosses the plane of the face so
+            close [mm].
+        off: Points are off that plane when they are so far from it [mm].
     """
     runtime.ensure_started()
     entries = len(point)
     if entries == 0:
         return np.zeros(0, np.int32)
-    source = np.zeros((1, 3)) if lines.source is None else lines.source
+    source = np.zeros((0, 3)) if lines.source is None else lines.source
     found = runtime.empty(entries, np.int32)
     _look_beyond(
-        entries, int(lines.source is not None), runtime.upload(np.array([gap, off])),
-        runtime.upload(lines.points), runtime.upload(lines.start), runtime.upload(lines.view),
-        runtime.upload(lines.lane), runtime.upload(source),
-        runtime.upload(field.astype(np.float64)),
+        runtime.upload(np.array([gap, off])), runtime.upload(lines.points),
+        runtime.upload(lines.start), runtime.upload(lines.view), runtime.upload(lines.lane),
+        runtime.upload(source), runtime.upload(field.astype(np.float64)),
         runtime.upload(np.stack([point, lines.run[point], side], axis=1).astype(np.int32)),
         runtime.upload(np.concatenate([normal, outward], axis=1)), found,
     )  # fmt: skip

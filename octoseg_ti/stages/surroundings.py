@@ -120,9 +120,13 @@ def _free_sectors(
         held = _occupied(point_in, leaf_in, block_in, c, p, u, v, square)
         # Small leaves end within the radius: those beyond count too. Few points get that far.
         for ring in range(2):
-            for k in range(start_in[c], start_in[c + 1]):
+            begin = start_in[c]
+            end = start_in[c + 1]
+            if _widest(held)[0] < FREE:
+                end = begin
+            for k in range(begin, end):
                 b = neighbor_in[k]
-                if _widest(held)[0] >= FREE and _apart(p, box_in, b) <= square:
+                if _apart(p, box_in, b) <= square:
                     if ring == 0:
                         held |= _occupied(point_in, leaf_in, block_in, b, p, u, v, square)
                     elif leaf_in[b, 2] == 1:
