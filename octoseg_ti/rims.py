@@ -78,8 +78,8 @@ def mark_rims(search: Search, lines: Lines, edge: np.ndarray) -> None:
     label, spacing = search.label, search.spacing
     asked = (edge == int(EdgeClass.NONE)) & (label >= 0)
     asked[asked] = search.analytic[label[asked]]
-    in_order = np.zeros(len(label), bool)
-    in_order[lines.order] = asked
+    in_order, known = np.zeros(len(label), bool), np.zeros(len(label), bool)
+    in_order[lines.order], known[lines.order] = asked, edge != int(EdgeClass.NONE)
     side = open_sides(lines, in_order, _GAP * spacing)[lines.order]
     point = np.flatnonzero(side > 0)
     leaves = search.leaves
@@ -88,7 +88,7 @@ def mark_rims(search: Search, lines: Lines, edge: np.ndarray) -> None:
     outward, free = around.free_sectors(search.device[1], point, leaf, _AROUND * spacing)
     there = np.flatnonzero((free >= FREE) & (free < SECTORS))
     point, leaf, outward = point[there], leaf[there], outward[there]
-    field, cut = fields(lines)
+    field, cut = fields(lines, known)
     place = lines.order[point]
     normal = normals_of(search, point, search.points[point])
     found = look_beyond(
@@ -103,23 +103,30 @@ def mark_rims(search: Search, lines: Lines, edge: np.ndarray) -> None:
     edge[near & (edge == int(EdgeClass.NONE))] = int(EdgeClass.SHARP)
 
 
-def fields(lines: Lines) -> tuple[np.ndarray, np.ndarray]:
+def fields(lines: Lines, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return where the stripes of every view end amid its field of view, and where none does.
+
+    Args:
+        lines: The points in scan order.
+        known: Which of them are at edges, where stripes end for another reason, shape (n,), bool.
 
     Returns:
         Lowest and highest lane of such an end, shape (V, 2); views whose stripes run from one limit
         to the other, so that their first and last stripe may as well have cut the part, (V,) bool.
     """
-    low, high = lines.lane[lines.start[:-1]], lines.lane[lines.start[1:] - 1]
+    first, last = lines.start[:-1], lines.start[1:] - 1
     views = int(lines.view.max(initial=0)) + 1
-    field, cut = np.zeros((views, 2)), np.zeros(views, bool)
-    for v in range(views):
-        mine = lines.view == v
-        if mine.any():
-            field[v] = low[mine].min() + _LIMIT, high[mine].max() - _LIMIT
-            ends = (low[mine] <= field[v, 0]).mean(), (high[mine] >= field[v, 1]).mean()
-            cut[v] = min(ends) >= _CUT
-    return field, cut
+    low, high = np.full(views, np.inf), np.full(views, -np.inf)
+    np.minimum.at(low, lines.view, lines.lane[first])
+    np.maximum.at(high, lines.view, lines.lane[last])
+    low, high = low + _LIMIT, high - _LIMIT
+    stripes = np.maximum(np.bincount(lines.view, minlength=views), 1)
+    at_low = (lines.lane[first] <= low[lines.view]) & ~known[first]
+    at_high = (lines.lane[last] >= high[lines.view]) & ~known[last]
+    share = np.minimum(
+        np.bincount(lines.view, at_low, views), np.bincount(lines.view, at_high, views)
+    )
+    return np.column_stack([low, high]), share >= _CUT * stripes
 
 
 def normals_of(search: Search, point: np.ndarray, place: np.ndarray) -> np.ndarray:

@@ -201,10 +201,10 @@ def _seen_across(
     t = s + step
     found = PASSED
     first = 1
-    while t >= 0 and t < stripes and found != HIDDEN:
-        if view_in[t] != view_in[s]:
-            t = stripes
-        else:
+    going = 1
+    while going == 1 and t >= 0 and t < stripes:
+        going = ti.cast(view_in[t] == view_in[s], ti.i32)
+        if going == 1:
             if found == PASSED:
                 found = ENDED
             k = _on_ray(lane_in, start_in, view_in, s, t, stripes, lane_in[i])
@@ -216,10 +216,12 @@ def _seen_across(
                     found = ti.select(far >= 0.0 and source_in.shape[0] > t, BEHIND, HIDDEN)
                     if far >= 0.0 and far <= gap:
                         found = BEHIND
-                        t = stripes
+                        going = 0
                 elif (q - p).dot(n) > off + _SLOPE * (q - p).norm():
                     found = HIDDEN
                 first = 0
+                if found == HIDDEN:
+                    going = 0
             t += step
     return found
 
