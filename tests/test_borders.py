@@ -127,6 +127,27 @@ def test_shallow_ridges_are_two_patches(turn: float) -> None:
     assert scores.edges["sharp"].precision > 0.8 and scores.edges["sharp"].recall > 0.6
 
 
+@pytest.mark.parametrize("noise", [0.005, 0.01, 0.025])
+def test_the_result_says_which_edges_the_noise_hides(noise: float) -> None:
+    def sides(turn_deg: float) -> tuple[int, Segmentation]:
+        scanner = StripeScanner(stripe_pitch=0.25, range_noise=noise)
+        scans, truth = simulate(bend(0.0, turn_deg, fillet=False, wide=11.0), scanner, seed=3)
+        result = segment(scans)
+        assert truth.normal is not None
+        up = (truth.normal[:, 2] > 0.5) & (truth.patch >= 0) & (result.labels >= 0)
+        main = [np.bincount(result.labels[up & (truth.patch == k)]).argmax()
+                for k in np.unique(truth.patch[up])]  # fmt: skip
+        return len(set(main)), result
+
+    told, result = sides(30.0)
+    assert told == 2 and result.edge_width == pytest.approx(11.0, rel=0.05)
+    limit = math.degrees(result.shallowest_edge)
+    assert 100.0 * noise < limit < 1000.0 * noise
+    assert ("the noise hides shallower ones" in str(result)) == (limit > 3.0)
+    assert sides(1.3 * limit)[0] == 2
+    assert sides(0.2 * limit)[0] == 1
+
+
 def test_fillets_can_be_left_out() -> None:
     params = Params(edges=EdgeParams(fillet_radius=0.0))
     result, _ = scanned(bend(1.5, 90.0, fillet=True), 0.01, params)
