@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from octoseg_ti.arrange import Arranged
+from octoseg_ti.base import distance_to_base
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.stages.normals import stripe_axes
 from octoseg_ti.stages.rims import (
@@ -99,8 +100,16 @@ def mark_rims(search: Search, lines: Lines, edge: np.ndarray) -> None:
     real |= ((found & PASSED) > 0) & ~cut[lines.view[lines.run[place]]]
     real &= (found & HIDDEN) == 0
     real[real] = ends_straight(search, point[real], outward[real], _GAP * spacing)
-    near = around.near(label, point[real], leaf[real], (EDGE - _INSIDE) * spacing)
-    edge[near & (edge == int(EdgeClass.NONE))] = int(EdgeClass.SHARP)
+    point, leaf = point[real], leaf[real]
+    near = around.near(label, point, leaf, EDGE * spacing)
+    inside = around.near(label, point, leaf, (EDGE - _INSIDE) * spacing)
+    base = distance_to_base(
+        search.points[point], normal[real], outward[real], label[point], search.points, spacing
+    )
+    if base is not None:
+        stands = near & np.isin(label, base[1])
+        inside[stands] = base[0][stands] <= EDGE * spacing
+    edge[inside & (edge == int(EdgeClass.NONE))] = int(EdgeClass.SHARP)
 
 
 def fields(lines: Lines, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
