@@ -2,7 +2,9 @@
 
 The bottom rim of a part, whose underside no view sees; the top of a step seen from above only.
 Where a face ends at an open border and what the probe saw beyond shows that it goes on no further,
-there is an edge. The rim of a shadow is none, nor is the end of the field of view.
+there is an edge. The rim of a shadow is none, nor is the end of the field of view. That a pass ends
+at the end of the part, not before, is taken for granted unless its stripes run from one end of the
+field of view to the other.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from octoseg_ti.arrange import Arranged
-from octoseg_ti.base import distance_to_base
+from octoseg_ti.base import find_base
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.stages.normals import stripe_axes
 from octoseg_ti.stages.rims import (
@@ -29,8 +31,7 @@ from octoseg_ti.zones import CAP, EDGE, Search
 _GAP = 3.0  # neighbours in scan order are at most so many spacings apart
 _AROUND = 2.5  # ... and neighbours among all points
 _OFF = 0.06  # what lies so many spacings off a face is behind it, plus a cap of noise
-# The edge lies up to a spacing beyond the last points, half of one on average. On its other side a
-# sector is as wide, so the mean would do; but points on the rim of two stripes count half.
+# The edge lies up to a spacing beyond the last points, or two where the last of a stripe is lost.
 _INSIDE = 0.75
 # A face ends straight when on the way outwards it turns by less than this share of its turn aside.
 _STRAIGHT = 0.3
@@ -77,39 +78,62 @@ def scan_lines(scans: Scans, arranged: Arranged, point: np.ndarray, order: np.nd
 def mark_rims(search: Search, lines: Lines, edge: np.ndarray) -> None:
     """Mark the points at rims as sharp, in place, where they are at no other edge."""
     label, spacing = search.label, search.spacing
+    around = Surroundings(search.device[0], search.leaves, search.box, _AROUND * spacing)
+    point, outward = find_rims(search, lines, edge, around)
+    leaf = leaf_of(search, point)
+    place = search.points[point]
+    normal = normals_of(search, point, place)
+    base = find_base(place, normal, outward, label[point], search.box, spacing)
+    stands = np.zeros(len(point), bool)
+    if base is not None:
+        stands = np.isin(label[point], base.walls)
+    near = around.near(label, point[~stands], leaf[~stands], (EDGE - _INSIDE) * spacing)
+    if base is not None:
+        low = np.flatnonzero(around.near(label, point[stands], leaf[stands], EDGE * spacing))
+        near[low[base.above(search.points[low]) <= EDGE * spacing]] = True
+    edge[near & (edge == int(EdgeClass.NONE))] = int(EdgeClass.SHARP)
+
+
+def find_rims(
+    search: Search, lines: Lines, edge: np.ndarray, around: Surroundings
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the last points of faces at rims, and the directions in which the faces end there.
+
+    Args:
+        search: What is known.
+        lines: The points in scan order.
+        edge: `EdgeClass` of every sorted point so far, shape (n,), u8.
+        around: The surroundings of points.
+    """
+    label, spacing = search.label, search.spacing
     asked = (edge == int(EdgeClass.NONE)) & (label >= 0)
     asked[asked] = search.analytic[label[asked]]
     in_order, known = np.zeros(len(label), bool), np.zeros(len(label), bool)
     in_order[lines.order], known[lines.order] = asked, edge != int(EdgeClass.NONE)
     side = open_sides(lines, in_order, _GAP * spacing)[lines.order]
     point = np.flatnonzero(side > 0)
-    leaves = search.leaves
-    leaf = np.searchsorted(leaves.first, point, side="right") - 1
-    around = Surroundings(search.device[0], leaves, search.box, _AROUND * spacing)
-    outward, free = around.free_sectors(search.device[1], point, leaf, _AROUND * spacing)
+    outward, free = around.free_sectors(
+        search.device[1], point, leaf_of(search, point), _AROUND * spacing
+    )
     there = np.flatnonzero((free >= FREE) & (free < SECTORS))
-    point, leaf, outward = point[there], leaf[there], outward[there]
+    point, outward = point[there], outward[there]
     field, cut = fields(lines, known)
     place = lines.order[point]
-    normal = normals_of(search, point, search.points[point])
     found = look_beyond(
-        lines, field, place, side[point], normal, outward,
+        lines, field, place, side[point], normals_of(search, point, search.points[point]), outward,
         gap=_GAP * spacing, off=_OFF * spacing + CAP * search.noise,
     )  # fmt: skip
     real = (found & (ENDED | BEHIND)) > 0
     real |= ((found & PASSED) > 0) & ~cut[lines.view[lines.run[place]]]
     real &= (found & HIDDEN) == 0
     real[real] = ends_straight(search, point[real], outward[real], _GAP * spacing)
-    point, leaf = point[real], leaf[real]
-    near = around.near(label, point, leaf, EDGE * spacing)
-    inside = around.near(label, point, leaf, (EDGE - _INSIDE) * spacing)
-    base = distance_to_base(
-        search.points[point], normal[real], outward[real], label[point], search.points, spacing
-    )
-    if base is not None:
-        stands = near & np.isin(label, base[1])
-        inside[stands] = base[0][stands] <= EDGE * spacing
-    edge[inside & (edge == int(EdgeClass.NONE))] = int(EdgeClass.SHARP)
+    return point[real], outward[real]
+
+
+def leaf_of(search: Search, point: np.ndarray) -> np.ndarray:
+    """Return the leaves that hold some points, shape (E,)."""
+    leaf: np.ndarray = np.searchsorted(search.leaves.first, point, side="right") - 1
+    return leaf
 
 
 def fields(lines: Lines, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from octoseg_ti.base import distance_to_base
+from octoseg_ti.base import find_base
 
 DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -34,6 +34,11 @@ def walls(lift: tuple[float, ...], rough: float, seed: int = 0) -> Rims:
     return Rims(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
+def boxes(points: np.ndarray) -> np.ndarray:
+    """A box for each point."""
+    return np.concatenate([points, points], axis=1)
+
+
 def turned(rims: Rims, seed: int) -> tuple[Rims, np.ndarray]:
     rotation = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
     return Rims(*(a @ rotation.T for a in rims[:3]), rims.label), rotation
@@ -43,37 +48,37 @@ def turned(rims: Rims, seed: int) -> tuple[Rims, np.ndarray]:
 def test_walls_with_ragged_rims_show_the_plane(seed: int) -> None:
     rims, rotation = turned(walls((0.0, 0.9, 0.0, 0.7), 0.8, seed), seed)
     cloud = np.random.default_rng(seed).uniform((-10, -10, 0), (10, 10, 9), (500, 3))
-    found = distance_to_base(*rims, cloud @ rotation.T, 1.0)
-    assert found is not None
-    far, names = found
-    np.testing.assert_allclose(far, cloud[:, 2], atol=0.12)
-    np.testing.assert_array_equal(names, [5, 6, 7, 8])
+    cloud = cloud @ rotation.T
+    base = find_base(*rims, boxes(cloud), 1.0)
+    assert base is not None
+    np.testing.assert_allclose(base.above(cloud), (cloud @ rotation)[:, 2], atol=0.12)
+    np.testing.assert_array_equal(base.walls, [5, 6, 7, 8])
 
 
 def test_where_all_rims_are_even_the_plane_is_above_the_next_stripe() -> None:
     # One wall ends 0.1 above its plane, another 0.8: the plane is 0 to 0.2 below the first.
     rims = walls((0.1, 0.8, 0.3, 0.8), 0.0)
-    found = distance_to_base(*rims, rims.point, 1.0)
-    assert found is not None
-    np.testing.assert_allclose(found[0], rims.point[:, 2], atol=0.12)
+    base = find_base(*rims, boxes(rims.point), 1.0)
+    assert base is not None
+    np.testing.assert_allclose(base.above(rims.point), rims.point[:, 2], atol=0.12)
 
 
 def test_no_plane_without_walls_that_agree() -> None:
     two = walls((0.0, 0.3), 0.5)
-    assert distance_to_base(*two, two.point, 1.0) is None
+    assert find_base(*two, boxes(two.point), 1.0) is None
     rims = walls((0.0, 4.0, 8.0, 2.0), 0.5)
-    assert distance_to_base(*rims, rims.point, 1.0) is None
+    assert find_base(*rims, boxes(rims.point), 1.0) is None
     # The part goes on below.
     rims = walls((0.0, 0.3, 0.0, 0.3), 0.5)
     below = np.concatenate([rims.point, [[0.0, 0.0, -3.0]]])
-    assert distance_to_base(*rims, below, 1.0) is None
+    assert find_base(*rims, boxes(below), 1.0) is None
     few = Rims(*(column[::10] for column in rims))
-    assert distance_to_base(*few, rims.point, 1.0) is None
+    assert find_base(*few, boxes(rims.point), 1.0) is None
     none = Rims(*(column[:0] for column in rims))
-    assert distance_to_base(*none, rims.point, 1.0) is None
+    assert find_base(*none, boxes(rims.point), 1.0) is None
 
 
 def test_faces_in_the_plane_do_not_stand_on_it() -> None:
     rims = walls((0.0, 0.3, 0.0, 0.3), 0.5)
     flat = Rims(rims.point, np.tile(-DOWN, (len(rims.point), 1)), rims.outward, rims.label)
-    assert distance_to_base(*flat, rims.point, 1.0) is None
+    assert find_base(*flat, boxes(rims.point), 1.0) is None
