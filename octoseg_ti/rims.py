@@ -53,8 +53,9 @@ def scan_lines(scans: Scans, arranged: Arranged, point: np.ndarray, order: np.nd
     first, last = start[:-1], start[1:] - 1
     view = arranged.view[first]
     source = None
-    if scans.stripe_origin is not None and scans.stripe is not None:
-        source = np.asarray(scans.stripe_origin, np.float64)[scans.stripe[arranged.row[first]]]
+    places, number = scans.stripe_origin, scans.stripe
+    if places is not None and number is not None and number.max() < len(places):
+        source = np.asarray(places, np.float64)[number[arranged.row[first]]]
     elif scans.origin is not None:
         source = np.asarray(scans.origin, np.float64)[view]
     if source is not None and not np.isfinite(source).all():
