@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 _ALIKE = 0.9  # cosine of the angle between the outward directions of rims of one plane
+_ROUNDS = 4  # after which their mean does not depend on where it began
 _FEWEST = 20  # rim points of a wall
 _WALLS = 3
 _OUTER = 0.95  # quantile of the rim points that stands for the outermost ones
@@ -109,6 +110,8 @@ def _mode(outward: np.ndarray) -> np.ndarray:
     """Return the direction that most of the directions are near."""
     some = outward[:: max(len(outward) // 50, 1)]
     support = [np.count_nonzero(_along(outward, to) >= _ALIKE) for to in some]
-    best = some[int(np.argmax(support))]
-    mean: np.ndarray = outward[_along(outward, best) >= _ALIKE].mean(axis=0)
-    return mean / np.linalg.norm(mean)
+    mode = some[int(np.argmax(support))]
+    for _ in range(_ROUNDS):
+        mode = outward[_along(outward, mode) >= _ALIKE].mean(axis=0)
+        mode /= np.linalg.norm(mode)
+    return mode

@@ -91,11 +91,15 @@ def _beside(
     The search goes on from point j to the end of that stripe, hi.
     """
     lane = lane_in[i]
-    while j + 1 < hi and ti.abs(lane_in[ti.min(j + 1, hi - 1)] - lane) <= ti.abs(lane_in[j] - lane):
-        j += 1
     near = 0
-    if j < hi and ti.abs(lane_in[j] - lane) <= _LANES:
-        near = _close(point_in, i, j, gap)
+    # Taichi works out both sides of "and": an empty stripe must not be read.
+    if j < hi:
+        while j + 1 < hi and (
+            ti.abs(lane_in[ti.min(j + 1, hi - 1)] - lane) <= ti.abs(lane_in[j] - lane)
+        ):
+            j += 1
+        if ti.abs(lane_in[j] - lane) <= _LANES:
+            near = _close(point_in, i, j, gap)
     return j, near
 
 
