@@ -19,7 +19,7 @@ _OUTER = 0.95  # quantile of the rim points that stands for the outermost ones
 _STEP = 1.25  # the outermost points are this near the plane [spacings]
 _EVEN = 0.25  # a rim whose points scatter less [spacings] runs along the stripes
 _SLOPE = 0.5  # a wall is no more inclined to the normal of the plane (cosine)
-_BELOW = 0.25  # no point is so far beyond the plane [spacings]
+_BELOW, _NOISES = 0.25, 4.0  # no point is so far beyond the plane [spacings, plus noises]
 
 
 class Base(NamedTuple):
@@ -45,6 +45,7 @@ def find_base(
     label: np.ndarray,
     box: np.ndarray,
     spacing: float,
+    noise: float = 0.0,
 ) -> Base | None:
     """Find the plane that walls stand on; None where there is no such plane.
 
@@ -55,6 +56,7 @@ def find_base(
         label: Their patches, shape (R,).
         box: Lower and upper corner of boxes that hold all points [mm], shape (C, 6).
         spacing: The larger of the two point spacings [mm].
+        noise: Deviation of a point from its surface [mm].
     """
     if len(point) < _WALLS * _FEWEST:
         return None
@@ -94,7 +96,7 @@ def find_base(
         base += 0.5 * max(outer[even].min() + spacing - base, 0.0)
     near &= np.bincount(of, np.abs(_along(facing, down))) / count < _SLOPE
     lowest = np.where(down > 0.0, box[:, 3:], box[:, :3])
-    beyond = _along(lowest, down).max() > base + _BELOW * spacing
+    beyond = _along(lowest, down).max() > base + _BELOW * spacing + _NOISES * noise
     if np.count_nonzero(near) < _WALLS or beyond:
         return None
     return Base(down, float(base), names[near])

@@ -84,7 +84,7 @@ def mark_rims(search: Search, lines: Lines, edge: np.ndarray) -> None:
     leaf = leaf_of(search, point)
     place = search.points[point]
     normal = normals_of(search, point, place)
-    base = find_base(place, normal, outward, label[point], search.box, spacing)
+    base = find_base(place, normal, outward, label[point], search.box, spacing, search.noise)
     stands = np.zeros(len(point), bool)
     if base is not None:
         stands = np.isin(label[point], base.walls)
