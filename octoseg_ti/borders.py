@@ -18,10 +18,12 @@ from typing import Any
 import numpy as np
 
 from octoseg_ti.fillets import ON, Fit, claim_points, fit_balls, refit_sides, strips_of
+from octoseg_ti.rims import mark_rims
 from octoseg_ti.stages.extraction import Surfaces
 from octoseg_ti.stages.leaves import Leaves
 from octoseg_ti.stages.marking import nearest_marked
 from octoseg_ti.stages.profiles import BALL
+from octoseg_ti.stages.rims import Lines
 from octoseg_ti.types import NONE, EdgeClass, SurfaceKind
 from octoseg_ti.zones import CAP, EDGE, Search, Zones, find_zones, ranges
 
@@ -59,6 +61,7 @@ def find_borders(
     noise: float,
     spacing: float,
     limit: float,
+    lines: Lines | None = None,
 ) -> Borders:
     """Find the edges between patches, and the fillets.
 
@@ -73,6 +76,8 @@ def find_borders(
         noise: Deviation of a point from its surface [mm].
         spacing: The larger of the two point spacings [mm].
         limit: Largest radius of a fillet [mm].
+        lines: The points in scan order, to find edges of which one face was scanned; None = these
+            are not looked for.
     """
     search = Search(points, normals, leaves, label, surface, surfaces, noise, spacing, limit)
     for turn in range(_ROUNDS):
@@ -86,6 +91,8 @@ def find_borders(
     number[fillets] = np.arange(len(fillets), dtype=np.int32)
     strip = strips_of(search, number)
     edge = mark_points(search, zones, fit, chosen, strip)
+    if lines is not None:
+        mark_rims(search, lines, edge)
     return Borders(
         edge=edge,
         fillet=number[search.claim],

@@ -16,6 +16,7 @@ from octoseg_ti.device.profiling import Trace
 from octoseg_ti.mirrors import probe_positions, without_mirror_images
 from octoseg_ti.params import Params, SurfaceParams, preset_params
 from octoseg_ti.patches import Regions, assemble, grow_regions
+from octoseg_ti.rims import scan_lines
 from octoseg_ti.stages.cleaning import mark_outliers
 from octoseg_ti.stages.edges import edges_by_level, edges_by_radius, edges_by_reason
 from octoseg_ti.stages.extraction import Surfaces
@@ -111,7 +112,7 @@ def segment(
         if probe is not None:
             found = without_mirror_images(grid, leaves, found, arranged, probe)
     with stage("borders"):
-        borders = trace_borders(grid, found, measured, params)
+        borders = trace_borders(scans, arranged, point, grid, found, measured, params)
     with stage("patches"):
         result = assemble(
             scans, arranged, point, normal, grid, leaves, found, borders, measured, params
@@ -350,13 +351,22 @@ def explain_regions(
 
 
 def trace_borders(
-    grid: Grid, found: Regions, measured: Measurement, params: Params
+    scans: Scans,
+    arranged: Arranged,
+    point: np.ndarray,
+    grid: Grid,
+    found: Regions,
+    measured: Measurement,
+    params: Params,
 ) -> Borders | None:
     """Find the edges between patches, and the fillets, by their surfaces."""
     if found.graph is None or found.count == 0 or params.edges.rule != "reason":
         return None
     assert found.surface is not None and found.kind is not None and found.parameters is not None
     assert params.surfaces.noise is not None
+    lines = None
+    if arranged.run is not None:
+        lines = scan_lines(scans, arranged, point, runtime.download(grid.order))
     return find_borders(
         grid.point,
         grid.normal,
@@ -367,6 +377,7 @@ def trace_borders(
         noise=params.surfaces.noise,
         spacing=spacing_of(measured),
         limit=params.edges.fillet_radius,
+        lines=lines,
     )
 
 

@@ -6,6 +6,7 @@ number of points, ``V`` of views, ``S`` of stripes, ``C`` of cells, ``K`` of pat
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING
@@ -17,6 +18,15 @@ if TYPE_CHECKING:
 
 NONE = -1
 """The label of a point that belongs to no patch."""
+
+SHALLOW_EDGE = 3.0
+"""Where the noise hides edges above this angle [deg], a report says so."""
+
+# A wedge with sides of width w that meet at an angle a leaves this times a w (root mean square) of
+# the parabola that fits it best; told apart is what stands out by so many noises.
+_WEDGE = 0.0361
+_STAND_OUT = 2.0
+_EDGE_WIDTH = 40.0  # spacings
 
 
 class SurfaceKind(IntEnum):
@@ -380,6 +390,27 @@ class Segmentation:
         """Number of distinct cell sizes."""
         return len(np.unique(self.cells.level))
 
+    @property
+    def edge_width(self) -> float:
+        """Width of the faces that `shallowest_edge` is stated for [mm]: 40 point spacings."""
+        return _EDGE_WIDTH * max(self.measured.spacing_along, self.measured.spacing_across)
+
+    @property
+    def shallowest_edge(self) -> float:
+        """Angle above which an edge between two faces is told from a bend [rad].
+
+        Two faces that meet at a shallow angle look like one that is bent; what tells is how far
+        they are from it, which grows with the angle and with the width of the faces. It has to
+        stand out from the distance at which points still lie on a surface (``surfaces.noise``). So
+        the angle goes down with the width: faces twice as wide as `edge_width` show half of it.
+        Between this angle and about a third of it edges are found by chance. NaN where no surfaces
+        were looked for.
+        """
+        noise, width = self.params.surfaces.noise, self.edge_width
+        if not self.params.surfaces.enabled or noise is None or not width > 0.0:
+            return math.nan
+        return min(_STAND_OUT * noise / (_WEDGE * width), math.pi)
+
     def __str__(self) -> str:
         """Say in a few lines what was found, and how."""
         labelled = float(np.mean(self.labels >= 0)) if len(self) else 0.0
@@ -405,6 +436,13 @@ class Segmentation:
             radius = self.fillets.radius
             lines.append(
                 f"  {len(radius)} fillets, radius {radius.min():.3g} to {radius.max():.3g} mm"
+            )
+        if not math.isnan(self.shallowest_edge):
+            shallow = math.degrees(self.shallowest_edge)
+            hidden = "; the noise hides shallower ones" if shallow > SHALLOW_EDGE else ""
+            lines.append(
+                f"  edges between faces {self.edge_width:.3g} mm wide are told from "
+                f"{shallow:.2g} deg on{hidden}"
             )
         if self.seconds:
             stages = ", ".join(f"{name} {1e3 * s:.1f}" for name, s in self.seconds.items())

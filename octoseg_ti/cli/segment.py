@@ -144,6 +144,8 @@ def summary(result: Segmentation) -> dict[str, Any]:
         "fillets": fillet_table(result),
         "registration": registration_figures(result.registration),
         "measured": asdict(result.measured),
+        "shallowest_edge_deg": float(np.degrees(result.shallowest_edge)),
+        "shallowest_edge_width_mm": result.edge_width,
         "params": result.params.to_dict(),
         "seconds": result.seconds,
     }
