@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from octoseg_ti.arrange import Arranged
-from octoseg_ti.borders import Borders
+from octoseg_ti.borders.tracing import Borders
 from octoseg_ti.defaults import spacing_of
 from octoseg_ti.device import runtime
 from octoseg_ti.device.surfaces import evaluate_surfaces

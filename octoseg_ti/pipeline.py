@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from octoseg_ti.arrange import Arranged, arrange, as_scans, without
-from octoseg_ti.borders import Borders, find_borders
+from octoseg_ti.borders.rims import scan_lines
+from octoseg_ti.borders.tracing import Borders, find_borders
 from octoseg_ti.defaults import derive, spacing_of
 from octoseg_ti.device import runtime
 from octoseg_ti.device.profiling import Trace
 from octoseg_ti.mirrors import probe_positions, without_mirror_images
 from octoseg_ti.params import Params, SurfaceParams, preset_params
 from octoseg_ti.patches import Regions, assemble, grow_regions
-from octoseg_ti.rims import scan_lines
 from octoseg_ti.stages.cleaning import mark_outliers
 from octoseg_ti.stages.edges import edges_by_level, edges_by_radius, edges_by_reason
 from octoseg_ti.stages.extraction import Surfaces

@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from octoseg_ti.borders.zones import CAP, Search, Zones, listed, points_of, thinned
 from octoseg_ti.stages.leaves import Samples
 from octoseg_ti.stages.marking import nearest_marked
 from octoseg_ti.stages.profiles import BALL, NOWHERE
 from octoseg_ti.stages.sets import fit_sets, spread
 from octoseg_ti.types import NONE
-from octoseg_ti.zones import CAP, Search, Zones, listed, points_of, thinned
 
 ON = 3.5
 """A point lies on a ball within so many noises."""

@@ -17,15 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from octoseg_ti.fillets import ON, Fit, claim_points, fit_balls, refit_sides, strips_of
-from octoseg_ti.rims import mark_rims
+from octoseg_ti.borders.fillets import ON, Fit, claim_points, fit_balls, refit_sides, strips_of
+from octoseg_ti.borders.rims import mark_rims
+from octoseg_ti.borders.zones import CAP, EDGE, Search, Zones, find_zones, ranges
 from octoseg_ti.stages.extraction import Surfaces
 from octoseg_ti.stages.leaves import Leaves
 from octoseg_ti.stages.marking import nearest_marked
 from octoseg_ti.stages.profiles import BALL
 from octoseg_ti.stages.rims import Lines
 from octoseg_ti.types import NONE, EdgeClass, SurfaceKind
-from octoseg_ti.zones import CAP, EDGE, Search, Zones, find_zones, ranges
 
 # Rounds of claims; between them surfaces are fitted anew without what was claimed.
 _ROUNDS = 2

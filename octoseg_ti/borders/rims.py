@@ -12,7 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from octoseg_ti.arrange import Arranged
-from octoseg_ti.base import find_base
+from octoseg_ti.borders.base import find_base
+from octoseg_ti.borders.zones import CAP, EDGE, Search
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.stages.normals import stripe_axes
 from octoseg_ti.stages.rims import (
@@ -26,7 +27,6 @@ from octoseg_ti.stages.rims import (
 )
 from octoseg_ti.stages.surroundings import FREE, SECTORS, Surroundings
 from octoseg_ti.types import EdgeClass, Scans
-from octoseg_ti.zones import CAP, EDGE, Search
 
 _GAP = 3.0  # neighbours in scan order are at most so many spacings apart
 _AROUND = 2.5  # ... and neighbours among all points

@@ -6,7 +6,6 @@ edge is the leaves where both patches are near, and those of its strips.
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.stages.extraction import Surfaces
 from octoseg_ti.stages.labelling import label_lists, near_lists
-from octoseg_ti.stages.leaves import Leaves
+from octoseg_ti.stages.leaves import Leaves, members_of
 from octoseg_ti.stages.profiles import NOWHERE, Places, place, sums
 from octoseg_ti.stages.sets import spread
 from octoseg_ti.types import NONE
@@ -79,10 +78,8 @@ class Search:
         self.noise, self.spacing, self.limit = noise, spacing, limit
         self.count = len(surface)
         self.analytic = surface >= 0
-        order = np.argsort(label, kind="stable")
-        ends = np.searchsorted(label[order], np.arange(self.count + 1))
-        self.members = [order[lo:hi] for lo, hi in pairwise(ends)]
-        self.size = np.diff(ends)
+        self.members = members_of(label, self.count)
+        self.size = np.array([len(m) for m in self.members], np.int64)
         which = np.maximum(surface, 0)
         self.table = np.zeros((self.count, 10))
         if len(surfaces):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from octoseg_ti.base import find_base
+from octoseg_ti.borders.base import find_base
 
 DOWN = np.array([0.0, 0.0, -1.0])
 
