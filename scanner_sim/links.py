@@ -8,6 +8,7 @@ import numpy as np
 from octoseg_ti.device import runtime, unionfind
 from octoseg_ti.device.linalg import row
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, I64Array, ti
+from octoseg_ti.device.searching import first_not_less
 from octoseg_ti.device.unionfind import unite
 
 _NEIGHBOURS = 6
@@ -84,13 +85,7 @@ def _numbered(root: np.ndarray) -> np.ndarray:
 @ti.func
 def _place_of(keys: ti.template(), key, start, stop):
     """Return where a key is among those from start to stop, which ascend; -1 = nowhere."""
-    low, high = start, stop
-    while low < high:
-        middle = (low + high) // 2
-        if keys[middle] < key:
-            low = middle + 1
-        else:
-            high = middle
+    low = first_not_less(keys, key, start, stop)
     place = -1
     if low < stop:
         if keys[low] == key:

@@ -16,6 +16,7 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, ti
+from octoseg_ti.device.searching import first_not_less
 
 NEXT, BEFORE, UP, DOWN = 1, 2, 4, 8
 """Sides of a point in scan order that may be open: along its stripe, and towards the next stripe
@@ -58,14 +59,7 @@ def _on_ray(
     """Return the point of stripe t on a ray, -1 if there is none or t belongs to another view."""
     found = -1
     if t >= 0 and t < stripes and view_in[ti.max(0, ti.min(t, stripes - 1))] == view_in[s]:
-        lo = start_in[t]
-        hi = start_in[t + 1] - 1
-        while lo < hi:
-            middle = (lo + hi) // 2
-            if lane_in[middle] < lane:
-                lo = middle + 1
-            else:
-                hi = middle
+        lo = first_not_less(lane_in, lane, start_in[t], start_in[t + 1] - 1)
         if lo > start_in[t] and lane - lane_in[lo - 1] < ti.abs(lane_in[lo] - lane):
             lo -= 1
         if ti.abs(lane_in[lo] - lane) <= _LANES:
