@@ -108,11 +108,25 @@ class _Search:
         """Return the label of every sorted point."""
         return runtime.download(self.labelling.choice.label)
 
-    def choose(self, passes: int = 1) -> None:
-        """Let the points choose among the surfaces that have points near them."""
+    def choose(self, passes: int = 1, *, closed: bool = True) -> None:
+        """Let the points choose among the surfaces near them; those of free forms where asked."""
         late = np.arange(len(self.surfaces)) >= self.early
         table = surface_table(self.surfaces.kind, self.surfaces.parameters, _HANDICAP * late)
-        self.own = self.labelling.choose(self.own, table, passes=passes, closed=self.free)
+        free = self.free if closed else None
+        self.own = self.labelling.choose(self.own, table, passes=passes, closed=free)
+
+    def open_seams(self) -> None:
+        """Give the leaves of free forms that the surfaces beside them explain back to these.
+
+        A seam between views that do not quite meet can make a group of its own with what is free.
+        """
+        if not self.free.any() or len(self.surfaces) == 0:
+            return
+        before = self.own
+        self.choose(passes=2, closed=False)
+        self.free &= np.minimum.reduceat(self.label, self.leaves.first) < 0
+        self.own = before
+        self.choose(passes=2)
 
     def add(
         self,
@@ -310,6 +324,7 @@ def find_surfaces(
         search.choose(passes=2)
         search.refit()
         search.choose()
+    search.open_seams()
     for _ in range(_MERGES):
         merged = search.merge()
         if not search.give_up() and not merged:

@@ -151,7 +151,10 @@ def test_permuting_views_permutes_the_labels(block, answer: Segmentation, seed: 
 
 def test_renumbered_stripes_change_nothing(block, answer: Segmentation) -> None:
     scans, _ = block
-    again = segment(replace(scans, stripe=(7 * scans.stripe + 5).astype(np.int32)))
+    stripe = (7 * scans.stripe + 5).astype(np.int32)
+    places = np.full((stripe.max() + 1, 3), np.nan)
+    places[5::7] = scans.stripe_origin[: scans.stripe.max() + 1]
+    again = segment(replace(scans, stripe=stripe, stripe_origin=places))
     np.testing.assert_array_equal(again.labels, answer.labels)
 
 
@@ -205,7 +208,14 @@ def test_far_from_the_origin_the_labels_are_the_same(
     shift = offset * np.array([1.0, -1.0, 0.5])
     T_world_view = scans.T_world_view.copy()
     T_world_view[:, :3, 3] += shift
-    far = segment(replace(scans, T_world_view=T_world_view, origin=scans.origin + shift))
+    far = segment(
+        replace(
+            scans,
+            T_world_view=T_world_view,
+            origin=scans.origin + shift,
+            stripe_origin=scans.stripe_origin + shift,
+        )
+    )
     assert same_partition(far.labels, answer.labels)
     np.testing.assert_allclose(far.points, answer.points + shift, rtol=0, atol=1e-15 * offset * 4)
 
@@ -220,7 +230,11 @@ def test_scaling_the_part_scales_the_answer(block, answer: Segmentation) -> None
     T_world_view[:, :3, 3] *= 2.0
     twice = segment(
         replace(
-            scans, points=2.0 * scans.points, origin=2.0 * scans.origin, T_world_view=T_world_view
+            scans,
+            points=2.0 * scans.points,
+            origin=2.0 * scans.origin,
+            stripe_origin=2.0 * scans.stripe_origin,
+            T_world_view=T_world_view,
         )
     )
     np.testing.assert_array_equal(twice.labels, answer.labels)
