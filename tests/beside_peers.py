@@ -25,7 +25,6 @@ import numpy as np
 import octoseg_ti
 from octoseg_ti import Scans, SurfaceKind, segment
 from octoseg_ti.device.profiling import Trace
-from octoseg_ti.types import EdgeClass
 
 # The harness knows four kinds of surface.
 _TYPES = {
@@ -70,7 +69,7 @@ def answer(given: Path, out: Path) -> None:
     if result.fillets is not None:
         # The truth of the harness knows no fillets; which patches are strips of one is told.
         strips = np.flatnonzero(result.fillets.strip >= 0)
-        labels[np.isin(labels, strips) | (result.edge == EdgeClass.FILLET)] = -1
+        labels[np.isin(labels, strips) | (result.fillets.point >= 0)] = -1
     labels.tofile(out / "labels.i32")
     result.normals.astype(np.float32).tofile(out / "normals.f32")
     types = np.array([_TYPES.get(SurfaceKind(int(k)), -1) for k in result.kind] + [-1], np.int32)
