@@ -98,13 +98,14 @@ def fit_balls(search: Search, zones: Zones) -> Fit:
     shape = np.column_stack([radius, hollow])[hope]
     cap = CAP * noise
     none[hope] = search.sums(task, shape * [0.0, 1.0], point, cap)
-    for turn_ in range(_NEWTON):
-        now[hope] = search.sums(task, shape, point, cap)
-        if turn_ + 1 < _NEWTON:
-            step = -now[hope, 1] / np.maximum(now[hope, 2], 1e-12)
-            least = 0.2 * shape[:, 0]
-            shape[:, 0] += np.clip(step, -least, least)
-            shape[:, 0] = np.clip(shape[:, 0], 0.02, 2.0 * search.limit)
+    # From the tolerance that radii were tried with down to that of the noise: where this is small
+    # no point lies within it of a ball whose radius is only about right.
+    for wide in np.append(np.geomspace(search.coarse(), cap, _NEWTON - 2), cap):
+        now[hope] = search.sums(task, shape, point, wide)
+        step = -now[hope, 1] / np.maximum(now[hope, 2], 1e-12)
+        least = 0.2 * shape[:, 0]
+        shape[:, 0] = np.clip(shape[:, 0] + np.clip(step, -least, least), 0.02, 2.0 * search.limit)
+    now[hope] = search.sums(task, shape, point, cap)
     radius[hope] = shape[:, 0]
     gain = (none[:, 0] - now[:, 0]) / noise**2
     rms = np.sqrt(now[:, 0] / np.maximum(total, 1))

@@ -74,7 +74,14 @@ def scanned(part: Part, noise: float, params: Params | None = None) -> tuple[Seg
 
 @pytest.mark.parametrize(
     ("radius", "noise", "limit"),
-    [(0.75, 0.01, 0.05), (3.0, 0.01, 0.05), (0.75, 0.025, 0.1), (1.5, 0.025, 0.1)],
+    [
+        (0.95, 0.0, 0.01),
+        (2.4, 0.0, 0.01),
+        (0.75, 0.01, 0.05),
+        (3.0, 0.01, 0.05),
+        (0.75, 0.025, 0.1),
+        (1.5, 0.025, 0.1),
+    ],
 )
 def test_a_fillet_between_planes(radius: float, noise: float, limit: float) -> None:
     result, scores = scanned(bend(radius, 90.0, fillet=True), noise)

@@ -1,0 +1,331 @@
+"""The search for the surfaces of a part, round after round.
+
+Groups that the flood fill found are explained by analytic surfaces; every point takes the surface
+near it that it fits best; points that fit none form new groups, until nothing new is found. Then
+surfaces that are one are merged, and surfaces that their neighbours explain are given up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from octoseg_ti.device import runtime
+from octoseg_ti.device.surfaces import evaluate_surfaces
+from octoseg_ti.device.unionfind import components
+from octoseg_ti.stages.extraction import Tolerance, explain
+from octoseg_ti.stages.grid import Grid
+from octoseg_ti.stages.labelling import (
+    Labelling,
+    Rule,
+    common_label,
+    own_lists,
+    surface_table,
+)
+from octoseg_ti.stages.leaves import (
+    Leaves,
+    Samples,
+    members_of,
+    sample_leaves,
+)
+from octoseg_ti.stages.merging import (
+    cut_out,
+    explained_by_others,
+    merge_surfaces,
+    smooth_contacts,
+)
+from octoseg_ti.stages.sets import Surfaces, fit_sets, lie_on, no_surfaces, spread
+from octoseg_ti.types import NONE
+
+NARROW = 2.0
+"""Normals of narrow faces, and of points at edges, may be off so many times more than others."""
+
+_ROUNDS = 2
+# Points of a leaf that speak for it: of all its points, and of those that fit nothing.
+_SAMPLES, _REST = 4, 6
+# ... and with the points around those; what these count.
+_AROUND, _HARDLY = 12, 1e-3
+# A leaf takes part in a new group when so many of its points fit nothing, or one in so many.
+_LEFT_POINTS, _LEFT_SHARE = 2, 3
+# Samples for fitting a surface anew.
+_REFIT = 300
+# ... away from other surfaces, if there are so many of these.
+_INNER = 40
+# A surface is given up when its neighbours explain its points with this mean square, in noises.
+_EXPLAINED = 2.0
+_MERGES = 8
+# By how much the cost of a surface found late must be lower, in squares of noises.
+_HANDICAP = 2.0
+# A free form has at least this many times the points of the smallest patch.
+_FREE = 10.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Surfaced:
+    """The surfaces of a part and the points on them."""
+
+    surfaces: Surfaces
+    """The surfaces, relative to the corner of the grid."""
+    label: np.ndarray
+    """Surface of every sorted point, -1 = none, shape (n,), i32."""
+    own: np.ndarray
+    """Surfaces with points in every leaf, ascending, then -1; shape (C, most), i32."""
+
+
+class _Search:
+    """What the rounds of the search share."""
+
+    def __init__(self, grid: Grid, leaves: Leaves, tolerance: Tolerance, rule: Rule) -> None:
+        self.grid, self.leaves, self.tolerance = grid, leaves, tolerance
+        self.samples = sample_leaves(grid, leaves, _SAMPLES)
+        self.surfaces = no_surfaces()
+        self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
+        self.labelling = Labelling(grid, leaves, rule)
+        # Pairs of surfaces that were found not to be one.
+        self.apart = np.zeros(0, np.int64)
+        # Surfaces found in what others left have to be clearly better where others fit.
+        self.early = 0
+        # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut
+        # out of a group, is no group of its own.
+        self.free = np.zeros(len(leaves), bool)
+        self.face = np.zeros(len(leaves), bool)
+
+    @property
+    def label(self) -> np.ndarray:
+        """Return the label of every sorted point."""
+        return runtime.download(self.labelling.choice.label)
+
+    def choose(self, passes: int = 1, *, closed: bool = True) -> None:
+        """Let the points choose among the surfaces near them; those of free forms where asked."""
+        late = np.arange(len(self.surfaces)) >= self.early
+        table = surface_table(self.surfaces.kind, self.surfaces.parameters, _HANDICAP * late)
+        free = self.free if closed else None
+        self.own = self.labelling.choose(self.own, table, passes=passes, closed=free)
+
+    def open_seams(self) -> None:
+        """Give the leaves of free forms that the surfaces beside them explain back to these.
+
+        A seam between views that do not quite meet can make a group of its own with what is free.
+        """
+        if not self.free.any() or len(self.surfaces) == 0:
+            return
+        before = self.own
+        self.choose(passes=2, closed=False)
+        self.free &= np.minimum.reduceat(self.label, self.leaves.first) < 0
+        self.own = before
+        self.choose(passes=2)
+
+    def add(
+        self,
+        samples: Samples,
+        sets: list[np.ndarray],
+        *,
+        apart: bool = True,
+        turn: float | None = None,
+    ) -> bool:
+        """Explain sets of samples; say whether that gave any new surface."""
+        tolerance = self.tolerance if turn is None else self.tolerance._replace(turn=turn)
+        # A line has no normals, and is no surface.
+        sets = [s for s in sets if 2 * np.count_nonzero(samples.normal[s].any(axis=1)) > len(s)]
+        new, label = explain(samples, self.leaves, sets, tolerance, apart=apart)
+        for members in sets:
+            large = samples.weight[members].sum() >= _FREE * self.tolerance.points
+            explained = np.any(label[members] >= 0)
+            if large or explained:
+                self.free[samples.leaf[members]] = not explained
+                self.face[samples.leaf[members]] |= not apart
+        if len(new) == 0:
+            return False
+        base = len(self.surfaces)
+        self.surfaces = self.surfaces.joined(new)
+        there = label >= 0
+        cell, rank = np.nonzero(self.own >= 0)
+        self.own = own_lists(
+            self.leaves,
+            np.concatenate([cell, samples.leaf[there]]),
+            np.concatenate([self.own[cell, rank], label[there] + base]),
+        )
+        return True
+
+    def refit(self) -> None:
+        """Fit the surfaces anew to the samples that chose them."""
+        label = self.label[self.samples.index]
+        members = members_of(label, len(self.surfaces))
+        # Points beside other surfaces may belong to these: where there are enough, others count.
+        inner = members_of(
+            np.where(self.inner()[self.samples.leaf], label, NONE), len(self.surfaces)
+        )
+        members = [
+            i if len(i) >= _INNER and 4 * len(i) >= len(m) else m
+            for i, m in zip(inner, members, strict=True)
+        ]
+        which = np.array([m for m, s in enumerate(members) if len(s) >= 10], np.int64)
+        sets = [spread(members[m], _REFIT) for m in which]
+        noise = self.tolerance.noise
+        fitted, fits = fit_sets(self.samples, sets, noise, robust=True)
+        new = lie_on(self.samples, sets, fitted, fits, 3.0 * noise, 0.5)
+        old = lie_on(self.samples, sets, fitted, self.surfaces.at(which[fitted]), 3.0 * noise, 0.5)
+        kind, parameters = self.surfaces.kind.copy(), self.surfaces.parameters.copy()
+        for k, f in enumerate(fitted):
+            if new[k].mean() >= old[k].mean() - 0.01:
+                kind[which[f]], parameters[which[f]] = fits.kind[k], fits.parameters[k]
+        self.surfaces = Surfaces(kind=kind, parameters=parameters)
+
+    def inner(self) -> np.ndarray:
+        """Return which leaves are full of one surface, as are all that touch them; (C,), bool."""
+        common = common_label(self.leaves, self.label)
+        border = common[self.leaves.a] != common[self.leaves.b]
+        inner = common >= 0
+        inner[self.leaves.a[border]] = False
+        inner[self.leaves.b[border]] = False
+        return inner
+
+    def rename(self, name: np.ndarray) -> None:
+        """Give surfaces other numbers; -1 gives them up."""
+        there = self.own >= 0
+        cell = np.nonzero(there)[0]
+        self.own = own_lists(self.leaves, cell, name[self.own[there]])
+
+    def rest(self, *, around: bool = False) -> tuple[Samples, list[np.ndarray]]:
+        """Return samples of the points that fit nothing, in connected sets.
+
+        Points ``around`` them come with them, but hardly count: a narrow face shares most of its
+        points with the faces beside it.
+        """
+        label, leaves = self.label, self.leaves
+        left = np.add.reduceat((label < 0).astype(np.int32), leaves.first)
+        there = (left > 0) & ~self.free & ~self.face
+        if not around:
+            there &= (left >= _LEFT_POINTS) | (_LEFT_SHARE * left >= leaves.count)
+        both = there[leaves.a] & there[leaves.b]
+        root = components(len(leaves), leaves.a[both], leaves.b[both])
+        size = np.bincount(root[there], left[there], minlength=len(leaves))
+        kept = there & (size[root] >= self.tolerance.points)
+        blocked = np.where(np.repeat(kept, leaves.count), NONE if around else label, 0)
+        samples = sample_leaves(
+            self.grid, leaves, _AROUND if around else _REST, label=blocked.astype(np.int32)
+        )
+        if around:
+            weight = np.where(label[samples.index] < 0, samples.weight, _HARDLY)
+            samples = replace(samples, weight=weight)
+        part = root[samples.leaf]
+        order = np.argsort(part, kind="stable")
+        cut = np.flatnonzero(np.diff(part[order])) + 1
+        return samples, [s for s in np.split(order, cut) if len(s)]
+
+    def merge(self) -> bool:
+        """Merge surfaces that are one; say whether there were any."""
+        label = self.label[self.samples.index]
+        pairs = smooth_contacts(self.leaves, self.own, self.samples, self.surfaces)
+        key = pairs[:, 0] * len(self.surfaces) + pairs[:, 1]
+        name, self.surfaces = merge_surfaces(
+            self.samples,
+            label,
+            self.surfaces,
+            pairs[~np.isin(key, self.apart)],
+            self.tolerance.noise,
+        )
+        changed = name != np.arange(len(name))
+        if not changed.any():
+            return False
+        changed[name[changed]] = True
+        self.apart = key[~changed[pairs].any(axis=1)]
+        self.rename(name)
+        self.choose()
+        return True
+
+    def give_up(self) -> bool:
+        """Give up surfaces that their neighbours explain; say whether there were any."""
+        gone = explained_by_others(
+            self.label,
+            runtime.download(self.labelling.choice.second),
+            runtime.download(self.labelling.choice.off),
+            len(self.surfaces),
+            _EXPLAINED,
+        )
+        if not gone.any():
+            return False
+        name = np.where(gone, NONE, np.arange(len(gone)))
+        self.rename(name)
+        self.choose()
+        return True
+
+    def give_up_slivers(self) -> None:
+        """Give up small surfaces that were cut out of the ragged rim of something else."""
+        label = self.label
+        size = np.bincount(label[label >= 0], minlength=len(self.surfaces))
+        small = size < _FREE * self.tolerance.points
+        here = np.flatnonzero(np.append(small, False)[label])
+        if len(here) == 0:
+            return
+        point, name = runtime.download(self.grid.point)[here], label[here]
+        far, _ = evaluate_surfaces(point, name, self.surfaces.kind, self.surfaces.parameters)
+        gone = cut_out(name, far / self.tolerance.noise, len(size))
+        if gone.any():
+            self.rename(np.where(gone, NONE, np.arange(len(gone))))
+            self.choose()
+
+
+def find_surfaces(
+    grid: Grid,
+    leaves: Leaves,
+    group: np.ndarray,
+    cut: np.ndarray,
+    tolerance: Tolerance,
+    rule: Rule,
+    *,
+    narrow: bool,
+) -> Surfaced:
+    """Find the analytic surfaces of a part, and the surface of every point.
+
+    Args:
+        grid: The sparse grid.
+        leaves: Its leaves.
+        group: Group of every leaf that the flood fill reached, -1 = none, shape (C,), i32.
+        cut: The same with groups of flat faces cut apart at the bends between them. It counts where
+            a group is no sum of surfaces: each of its faces may still be one.
+        tolerance: What counts as lying on a surface.
+        rule: What a point may differ from the surface that it takes.
+        narrow: Positions are so exact that they tell narrow faces, whose normals do not.
+    """
+    search = _Search(grid, leaves, tolerance, rule)
+    samples = search.samples
+    search.add(samples, _sets_of(samples, leaves, group, tolerance.points))
+    if search.free.any():
+        inside = np.where(search.free, cut, NONE)
+        faces = _sets_of(samples, leaves, inside, tolerance.points)
+        search.add(samples, faces, apart=False)
+    search.early = len(search.surfaces)
+    for _ in range(_ROUNDS):
+        search.choose(passes=2)
+        search.refit()
+        search.choose()
+        rest, sets = search.rest()
+        if not sets or not search.add(rest, sets):
+            break
+    else:
+        search.choose(passes=2)
+    rest, sets = search.rest(around=True) if narrow else (rest, [])
+    # Normals of narrow faces are those of the faces beside them.
+    if sets and search.add(rest, sets, turn=NARROW * tolerance.turn):
+        search.choose(passes=2)
+        search.refit()
+        search.choose()
+    search.open_seams()
+    for _ in range(_MERGES):
+        merged = search.merge()
+        if not search.give_up() and not merged:
+            break
+    search.early = len(search.surfaces)
+    search.choose()
+    search.give_up_slivers()
+    return Surfaced(surfaces=search.surfaces, label=search.label, own=search.own)
+
+
+def _sets_of(samples: Samples, leaves: Leaves, group: np.ndarray, least: float) -> list[np.ndarray]:
+    """Return the samples of every group that has enough points."""
+    part = group[samples.leaf]
+    there = group >= 0
+    size = np.bincount(group[there], leaves.count[there], minlength=1)
+    return [s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= least]
