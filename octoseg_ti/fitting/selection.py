@@ -51,6 +51,7 @@ def choose(
     noise: float | np.ndarray,
     room: float = _ROOM,
     signed: bool = True,
+    spread: bool = True,
 ) -> Choice:
     """Choose the kind of every group.
 
@@ -65,6 +66,7 @@ def choose(
         noise: Standard deviation of a point about its surface [mm], of all or of every group, (G,).
         room: A kind fits up to this many times the noise, in rms.
         signed: Normals point to the probe, so that both sides of a sheet are no plane.
+        spread: The covariances are asked for; else they are NaN.
 
     Returns:
         The choice. Of a robust fit the loss counts, so that points out of reach speak for no kind.
@@ -88,14 +90,14 @@ def choose(
     nearest = np.argmin(np.where(possible, fits.rms, np.inf), axis=1)
     kind = np.where(found, best, int(SurfaceKind.FREE_FORM))
     kind[~possible.any(axis=1)] = int(SurfaceKind.NONE)
-    spread = np.full((groups, 8, 8), np.nan)
-    if found.any():
-        spread[found] = covariance(fits, np.minimum(best, KINDS - 1))[found]
+    covariances = np.full((groups, 8, 8), np.nan)
+    if spread and found.any():
+        covariances[found] = covariance(fits, np.minimum(best, KINDS - 1))[found]
     return Choice(
         kind=kind.astype(np.int8),
         parameters=np.where(found[:, None], fits.parameters[rows, best], np.nan),
         rms=fits.rms[rows, np.where(found, best, nearest)],
-        covariance=spread,
+        covariance=covariances,
         side=np.where(found, np.sign(np.nan_to_num(fits.side[rows, best])), 0.0),
         evidence=evidence,
     )

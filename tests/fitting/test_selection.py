@@ -100,6 +100,18 @@ def test_both_sides_of_a_sheet_are_no_plane() -> None:
     assert choose(fits, noise=0.02, signed=False).kind[0] == PLANE
 
 
+def test_covariances_are_made_where_asked_for() -> None:
+    flat = np.random.default_rng(1).uniform(-10, 10, (200, 2))
+    points = np.column_stack((flat, 0.01 * flat[:, 0]))
+    up = np.tile([0.0, 0.0, 1.0], (200, 1))
+    fits = fit_all(points, up, None, np.array([0, 200], np.int32), noise=0.02)
+    with_them, without = choose(fits, noise=0.02), choose(fits, noise=0.02, spread=False)
+    assert np.isfinite(with_them.covariance[0, :3, :3]).all()
+    assert np.isnan(without.covariance).all()
+    np.testing.assert_array_equal(with_them.parameters, without.parameters)
+    assert with_them.kind[0] == without.kind[0] == PLANE
+
+
 def test_points_of_the_neighbour_do_not_change_the_kind() -> None:
     rng = np.random.default_rng(0)
     cases, groups = [], []
