@@ -1,5 +1,7 @@
 """Every file of both packages keeps the conventions, and the checker would notice if not."""
 
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -124,3 +126,16 @@ def test_long_file_and_empty_name_are_found() -> None:
 
 def test_the_command_line_may_print() -> None:
     assert findings('"""Doc."""\nprint(1)\n', "octoseg_ti/cli/output.py") == []
+
+
+def test_the_front_page_holds_only_what_belongs_there() -> None:
+    """The packages, tests and recordings, and what describes them: nothing is left lying about."""
+    if not (ROOT / ".git").exists() or shutil.which("git") is None:
+        pytest.skip("not a checkout")
+    listed = ["git", "-c", f"safe.directory={ROOT}", "ls-files"]
+    done = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True)
+    top = {name.split("/")[0] for name in done.stdout.splitlines()}
+    assert top <= {
+        ".ci", ".gitignore", "LICENSE", "README.md", "pyproject.toml",
+        "octoseg_ti", "scanner_sim", "tests", "recordings",
+    }  # fmt: skip
