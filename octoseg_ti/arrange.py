@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from octoseg_ti.errors import DataError
-from octoseg_ti.types import Scans
+from octoseg_ti.types import Registration, Scans
 
 _LONG_PIECE = 50  # rows; pieces that are shorter on average are gathered row by row
 
@@ -155,6 +155,30 @@ def arrange(scans: Scans) -> Arranged:
     start = np.append(first, len(row)).astype(np.int32)
     run = np.repeat(np.arange(len(first), dtype=np.int32), np.diff(start))
     return _arranged(scans, row, view, run, start, whole)
+
+
+def probe_positions(
+    scans: Scans, arranged: Arranged, aligned: Registration | None
+) -> np.ndarray | None:
+    """Return where the probe was at every run of points [mm], world frame, shape (S, 3), f64.
+
+    Args:
+        scans: The scans, as `as_scans` returns them.
+        arranged: Their usable points.
+        aligned: How the views were moved, if they were: the probe moves with them.
+
+    Returns:
+        The positions, NaN where one is not known; None where none is. One position for a whole view
+        (`Scans.origin`) is none: the probe moved on while it measured.
+    """
+    if scans.stripe_origin is None or scans.stripe is None or arranged.start is None:
+        return None
+    first = arranged.start[:-1]
+    place: np.ndarray = scans.stripe_origin[scans.stripe[arranged.row[first]]]
+    if aligned is not None:
+        change = aligned.change()[arranged.view[first]]
+        place = np.einsum("nij,nj->ni", change[:, :3, :3], place) + change[:, :3, 3]
+    return place if np.isfinite(place).all(axis=1).any() else None
 
 
 def without(arranged: Arranged, marked: np.ndarray, rows: int) -> Arranged:

@@ -18,7 +18,7 @@ from octoseg_ti.patches import Regions
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.leaves import leaf_graph, sample_leaves
 from octoseg_ti.stages.sight import blocked_lines
-from octoseg_ti.types import NONE, Registration, Scans
+from octoseg_ti.types import NONE
 
 # A region is of one view when so many of its points are, the rest being strays.
 _ONE_VIEW = 0.8
@@ -28,30 +28,6 @@ _LINES, _SHARE, _FEWEST = 64, 0.25, 4
 # What is this near to a point does not block its line, and so near to a line a point blocks it, in
 # smallest cells: nearly two spacings, and nearly one.
 _CLEAR, _REACH = 1.0, 0.5
-
-
-def probe_positions(
-    scans: Scans, arranged: Arranged, aligned: Registration | None
-) -> np.ndarray | None:
-    """Return where the probe was at every run of points [mm], world frame, shape (S, 3), f64.
-
-    Args:
-        scans: The scans.
-        arranged: Their usable points.
-        aligned: How the views were moved, if they were.
-
-    Returns:
-        The positions, NaN where one is not known; None where none is. One position for a whole view
-        (`Scans.origin`) is none: the probe moved on while it measured.
-    """
-    if scans.stripe_origin is None or scans.stripe is None or arranged.start is None:
-        return None
-    first = arranged.start[:-1]
-    place: np.ndarray = scans.stripe_origin[scans.stripe[arranged.row[first]]]
-    if aligned is not None:
-        change = aligned.change()[arranged.view[first]]
-        place = np.einsum("nij,nj->ni", change[:, :3, :3], place) + change[:, :3, 3]
-    return place if np.isfinite(place).all(axis=1).any() else None
 
 
 def without_mirror_images(

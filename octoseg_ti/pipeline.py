@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from octoseg_ti.arrange import Arranged, arrange, as_scans, without
+from octoseg_ti.arrange import Arranged, arrange, as_scans, probe_positions, without
 from octoseg_ti.borders.rims import scan_lines
 from octoseg_ti.borders.tracing import Borders, find_borders
+from octoseg_ti.borders.zones import Search
 from octoseg_ti.defaults import derive, spacing_of
 from octoseg_ti.device import runtime
 from octoseg_ti.device.profiling import Trace
-from octoseg_ti.mirrors import probe_positions, without_mirror_images
+from octoseg_ti.mirrors import without_mirror_images
 from octoseg_ti.params import Params, SurfaceParams, preset_params
 from octoseg_ti.patches import Regions, assemble, grow_regions
 from octoseg_ti.stages.cleaning import mark_outliers
@@ -108,11 +109,11 @@ def segment(
         measured, params, found = explain_regions(
             grid, leaves, found, arranged.view, measured, params, asked, curved=curved
         )
-        probe = probe_positions(scans, arranged, aligned) if params.cleaning.enabled else None
-        if probe is not None:
+        probe = probe_positions(scans, arranged, aligned)
+        if probe is not None and params.cleaning.enabled:
             found = without_mirror_images(grid, leaves, found, arranged, probe)
     with stage("borders"):
-        borders = trace_borders(scans, arranged, point, grid, found, measured, params)
+        borders = trace_borders(scans, arranged, point, probe, grid, found, measured, params)
     with stage("patches"):
         result = assemble(
             scans, arranged, point, normal, grid, leaves, found, borders, measured, params
@@ -354,6 +355,7 @@ def trace_borders(
     scans: Scans,
     arranged: Arranged,
     point: np.ndarray,
+    probe: np.ndarray | None,
     grid: Grid,
     found: Regions,
     measured: Measurement,
@@ -366,8 +368,8 @@ def trace_borders(
     assert params.surfaces.noise is not None
     lines = None
     if arranged.run is not None:
-        lines = scan_lines(scans, arranged, point, runtime.download(grid.order))
-    return find_borders(
+        lines = scan_lines(scans, arranged, point, runtime.download(grid.order), probe)
+    search = Search(
         grid.point,
         grid.normal,
         found.graph,
@@ -377,8 +379,8 @@ def trace_borders(
         noise=params.surfaces.noise,
         spacing=spacing_of(measured),
         limit=params.edges.fillet_radius,
-        lines=lines,
     )
+    return find_borders(search, lines)
 
 
 def find_edges(grid: Grid, params: Params) -> tuple[np.ndarray, np.ndarray]:

@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 NONE = -1
 """The label of a point that belongs to no patch."""
 
-SHALLOW_EDGE = 3.0
-"""Where the noise hides edges above this angle [deg], a report says so."""
-
+_SHALLOW_EDGE = 3.0  # where the noise hides edges above this angle [deg], that is said
 # A wedge with sides of width w that meet at an angle a leaves this times a w (root mean square) of
 # the parabola that fits it best; told apart is what stands out by so many noises.
 _WEDGE = 0.0361
@@ -104,7 +102,8 @@ class Scans:
     origin: np.ndarray | None = None
     """A probe position of every view [mm], world frame, shape (V, 3), f64: tells the outer side."""
     stripe_origin: np.ndarray | None = None
-    """Probe position at every stripe [mm], world frame, shape (S, 3), S = largest stripe + 1."""
+    """Probe position at every stripe [mm], world frame, shape (S, 3), S = largest stripe + 1;
+    NaN where it is not known."""
     frame: str = "world"
     """Frame of ``points`` and ``normals``: "world", or "view" (then ``T_world_view`` is given)."""
     name: str = ""
@@ -399,17 +398,22 @@ class Segmentation:
     def shallowest_edge(self) -> float:
         """Angle above which an edge between two faces is told from a bend [rad].
 
-        Two faces that meet at a shallow angle look like one that is bent; what tells is how far
-        they are from it, which grows with the angle and with the width of the faces. It has to
-        stand out from the distance at which points still lie on a surface (``surfaces.noise``). So
-        the angle goes down with the width: faces twice as wide as `edge_width` show half of it.
-        Between this angle and about a third of it edges are found by chance. NaN where no surfaces
-        were looked for.
+        Two faces that meet at a shallow angle look like one that is bent. How far they are from it
+        has to stand out from ``surfaces.noise``, and grows with the angle and the width: faces twice
+        as wide as `edge_width` show half of this angle. Between it and about a third of it edges
+        are found by chance. NaN where no surfaces were looked for.
         """
         noise, width = self.params.surfaces.noise, self.edge_width
         if not self.params.surfaces.enabled or noise is None or not width > 0.0:
             return math.nan
         return min(_STAND_OUT * noise / (_WEDGE * width), math.pi)
+
+    def told_edges(self) -> tuple[str, str]:
+        """Say which edges the noise allows to tell: between what faces, and from what angle on."""
+        angle = math.degrees(self.shallowest_edge)
+        hidden = "; the noise hides shallower ones" if angle > _SHALLOW_EDGE else ""
+        faces = f"edges between faces {self.edge_width:.3g} mm wide are told from"
+        return faces, f"{angle:.2g} deg on{hidden}"
 
     def __str__(self) -> str:
         """Say in a few lines what was found, and how."""
@@ -438,12 +442,7 @@ class Segmentation:
                 f"  {len(radius)} fillets, radius {radius.min():.3g} to {radius.max():.3g} mm"
             )
         if not math.isnan(self.shallowest_edge):
-            shallow = math.degrees(self.shallowest_edge)
-            hidden = "; the noise hides shallower ones" if shallow > SHALLOW_EDGE else ""
-            lines.append(
-                f"  edges between faces {self.edge_width:.3g} mm wide are told from "
-                f"{shallow:.2g} deg on{hidden}"
-            )
+            lines.append("  " + " ".join(self.told_edges()))
         if self.seconds:
             stages = ", ".join(f"{name} {1e3 * s:.1f}" for name, s in self.seconds.items())
             lines.append(f"  milliseconds: {stages}")

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from octoseg_ti.arrange import arrange, as_scans, without
+from octoseg_ti.arrange import arrange, as_scans, probe_positions, without
 from octoseg_ti.errors import DataError
-from octoseg_ti.types import Scans
+from octoseg_ti.types import Registration, Scans
 
 POINTS = np.random.default_rng(0).uniform(0, 9, (12, 3))
 
@@ -165,3 +165,38 @@ def test_two_views_with_one_stripe_each_are_no_surface() -> None:
     """Stripes of different views are never joined, but that is not known to be an error yet."""
     arranged = arrange(as_scans(POINTS, stripe=LONG // 6, view=LONG // 6))
     assert arranged.start is not None and arranged.start.tolist() == [0, 6, 12]
+
+
+def test_the_probe_moves_with_its_view() -> None:
+    view = np.repeat([0, 1], 6).astype(np.int32)
+    stripe = np.repeat([1, 0, 2, 4], 3).astype(np.int32)
+    places = np.arange(15.0).reshape(5, 3)
+    scans = as_scans(Scans(points=POINTS, stripe=stripe, view=view, stripe_origin=places))
+    arranged = arrange(scans)
+    own = stripe[arranged.row[arranged.start[:-1]]]
+    np.testing.assert_array_equal(probe_positions(scans, arranged, None), places[own])
+
+    recorded = np.tile(np.eye(4), (2, 1, 1))
+    refined = recorded.copy()
+    refined[1, :3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    refined[1, :3, 3] = [1, 2, 3]
+    none = np.zeros(0, np.int32)
+    aligned = Registration(
+        recorded=recorded, refined=refined, datum=none, left=none, open=np.zeros(2, np.int32),
+        pairs=np.zeros((0, 2), np.int32), matches=none, before=np.zeros(0), after=np.zeros(0),
+    )  # fmt: skip
+    expected = places[own]
+    moved = np.isin(own, [2, 4])
+    expected[moved] = expected[moved] @ refined[1, :3, :3].T + refined[1, :3, 3]
+    np.testing.assert_allclose(probe_positions(scans, arranged, aligned), expected)
+
+
+def test_places_that_are_not_known_are_told() -> None:
+    stripe = np.repeat([0, 1, 2, 3], 3).astype(np.int32)
+    places = np.full((4, 3), np.nan)
+    scans = as_scans(Scans(points=POINTS, stripe=stripe, stripe_origin=places))
+    assert probe_positions(scans, arrange(scans), None) is None
+    places[2] = 7.0
+    scans = as_scans(Scans(points=POINTS, stripe=stripe, stripe_origin=places))
+    found = probe_positions(scans, arrange(scans), None)
+    assert np.isfinite(found).all(axis=1).tolist() == [False, False, True, False]

@@ -176,7 +176,7 @@ def drop_weak_claims(search: Search, zones: Zones, fit: Fit) -> None:
     mark = search.claim.copy()
     mark[mine[weak]] = NONE
     mine, pair = mine[weak], pair[weak]
-    leaf = np.searchsorted(search.leaves.first, mine, side="right") - 1
+    leaf = search.leaf_of(mine)
     reach = np.sqrt(2.0 * ON * search.noise * np.abs(fit.radius[pair])) + search.spacing
     far = nearest_marked(search.device[0], mark, search.leaves, search.box, mine, leaf, pair, reach)
     search.claim[mine[~np.isfinite(far)]] = NONE

@@ -39,7 +39,13 @@ _LIMIT = 3.0  # a stripe that ends so many lanes from the longest of its view ma
 _CUT = 0.5  # stripes run across the whole field of view when this share of them ends at its limit
 
 
-def scan_lines(scans: Scans, arranged: Arranged, point: np.ndarray, order: np.ndarray) -> Lines:
+def scan_lines(
+    scans: Scans,
+    arranged: Arranged,
+    point: np.ndarray,
+    order: np.ndarray,
+    probe: np.ndarray | None,
+) -> Lines:
     """Return the points in scan order, with the ray that saw each.
 
     Args:
@@ -47,17 +53,15 @@ def scan_lines(scans: Scans, arranged: Arranged, point: np.ndarray, order: np.nd
         arranged: Its usable points, on stripes.
         point: Their positions in the world [mm], shape (n, 3), f64.
         order: Place in scan order of every sorted point, shape (n,).
+        probe: Where the probe was at every run [mm], world frame, shape (S, 3); None = not known.
     """
     start, run = arranged.start, arranged.run
     assert start is not None and run is not None
     first, last = start[:-1], start[1:] - 1
     view = arranged.view[first]
-    source = None
-    places, number = scans.stripe_origin, scans.stripe
-    if places is not None and number is not None and number.max() < len(places):
-        source = np.asarray(places, np.float64)[number[arranged.row[first]]]
-    elif scans.origin is not None:
-        source = np.asarray(scans.origin, np.float64)[view]
+    source = probe
+    if source is None and scans.origin is not None:
+        source = scans.origin[view]
     if source is not None and not np.isfinite(source).all():
         source = None
     views = int(view.max(initial=0)) + 1
@@ -81,7 +85,7 @@ def mark_rims(search: Search, lines: Lines, edge: np.ndarray) -> None:
     label, spacing = search.label, search.spacing
     around = Surroundings(search.device[0], search.leaves, search.box, _AROUND * spacing)
     point, outward = find_rims(search, lines, edge, around)
-    leaf = leaf_of(search, point)
+    leaf = search.leaf_of(point)
     place = search.points[point]
     normal = normals_of(search, point, place)
     base = find_base(place, normal, outward, label[point], search.box, spacing, search.noise)
@@ -114,7 +118,7 @@ def find_rims(
     side = open_sides(lines, in_order, _GAP * spacing)[lines.order]
     point = np.flatnonzero(side > 0)
     outward, free = around.free_sectors(
-        search.device[1], point, leaf_of(search, point), _AROUND * spacing
+        search.device[1], point, search.leaf_of(point), _AROUND * spacing
     )
     there = np.flatnonzero((free >= FREE) & (free < SECTORS))
     point, outward = point[there], outward[there]
@@ -129,12 +133,6 @@ def find_rims(
     real &= (found & HIDDEN) == 0
     real[real] = ends_straight(search, point[real], outward[real], _GAP * spacing)
     return point[real], outward[real]
-
-
-def leaf_of(search: Search, point: np.ndarray) -> np.ndarray:
-    """Return the leaves that hold some points, shape (E,)."""
-    leaf: np.ndarray = np.searchsorted(search.leaves.first, point, side="right") - 1
-    return leaf
 
 
 def fields(lines: Lines, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

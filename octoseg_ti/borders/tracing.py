@@ -13,15 +13,12 @@ other, and so are cylinders that touch nothing along their sides: bosses, holes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from octoseg_ti.borders.fillets import ON, Fit, claim_points, fit_balls, refit_sides, strips_of
 from octoseg_ti.borders.rims import mark_rims
 from octoseg_ti.borders.zones import CAP, EDGE, Search, Zones, find_zones, ranges
-from octoseg_ti.stages.extraction import Surfaces
-from octoseg_ti.stages.leaves import Leaves
 from octoseg_ti.stages.marking import nearest_marked
 from octoseg_ti.stages.profiles import BALL
 from octoseg_ti.stages.rims import Lines
@@ -50,36 +47,14 @@ class Borders:
     """Fillet that every patch is a strip of, -1 = none, shape (K,), i32."""
 
 
-def find_borders(
-    points: Any,
-    normals: Any,
-    leaves: Leaves,
-    label: np.ndarray,
-    surface: np.ndarray,
-    surfaces: Surfaces,
-    *,
-    noise: float,
-    spacing: float,
-    limit: float,
-    lines: Lines | None = None,
-) -> Borders:
+def find_borders(search: Search, lines: Lines | None = None) -> Borders:
     """Find the edges between patches, and the fillets.
 
     Args:
-        points: Sorted positions relative to the corner of the grid [mm], shape (n, 3), f64 (kernel
-            array).
-        normals: Their unit normals, shape (n, 3), f64 (kernel array).
-        leaves: The leaves.
-        label: Patch of every point, -1 = none, shape (n,), i32.
-        surface: Surface of every patch, -1 = none, shape (K,), i32.
-        surfaces: The surfaces.
-        noise: Deviation of a point from its surface [mm].
-        spacing: The larger of the two point spacings [mm].
-        limit: Largest radius of a fillet [mm].
+        search: The points, their patches and the surfaces of these.
         lines: The points in scan order, to find edges of which one face was scanned; None = these
             are not looked for.
     """
-    search = Search(points, normals, leaves, label, surface, surfaces, noise, spacing, limit)
     for turn in range(_ROUNDS):
         if turn:
             refit_sides(search)

@@ -68,10 +68,25 @@ class Search:
         label: np.ndarray,
         surface: np.ndarray,
         surfaces: Surfaces,
+        *,
         noise: float,
         spacing: float,
         limit: float,
     ) -> None:
+        """Take what the search begins with.
+
+        Args:
+            points: Sorted positions relative to the corner of the grid [mm], shape (n, 3), f64
+                (kernel array).
+            normals: Their unit normals, shape (n, 3), f64 (kernel array).
+            leaves: The leaves.
+            label: Patch of every point, -1 = none, shape (n,), i32.
+            surface: Surface of every patch, -1 = none, shape (K,), i32.
+            surfaces: The surfaces.
+            noise: Deviation of a point from its surface [mm].
+            spacing: The larger of the two point spacings [mm].
+            limit: Largest radius of a fillet [mm].
+        """
         self.device = points, normals
         self.points, self.normals = runtime.download(points), runtime.download(normals)
         self.leaves, self.label = leaves, label
@@ -103,6 +118,11 @@ class Search:
             ],
             axis=1,
         )
+
+    def leaf_of(self, point: np.ndarray) -> np.ndarray:
+        """Return the leaves that hold some points, shape (E,)."""
+        leaf: np.ndarray = np.searchsorted(self.leaves.first, point, side="right") - 1
+        return leaf
 
     def set_sides(self) -> None:
         """Say for every surface on which side the air is."""

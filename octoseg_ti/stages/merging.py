@@ -273,9 +273,8 @@ def pieces(leaves: Leaves, own: np.ndarray, count: int) -> np.ndarray:
         count: Number of surfaces M.
 
     Returns:
-        Piece of every entry of ``own``, named by the number of its first entry among those that
-        are, row by row; -1 where there is none; shape
-        (C, most), i32.
+        Piece of every entry of ``own``, shape (C, most), i32, -1 where that holds no surface. A
+        piece has the number of its first entry, of those that hold one counted row by row.
     """
     most = own.shape[1]
     entry = np.flatnonzero(own.ravel() >= 0)

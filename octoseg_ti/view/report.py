@@ -22,14 +22,7 @@ import numpy as np
 
 from octoseg_ti.errors import DataError
 from octoseg_ti.evaluation import Scores
-from octoseg_ti.types import (
-    SHALLOW_EDGE,
-    Registration,
-    Segmentation,
-    StopReason,
-    SurfaceKind,
-    Truth,
-)
+from octoseg_ti.types import Registration, Segmentation, StopReason, SurfaceKind, Truth
 from octoseg_ti.view.scene import finite_rows
 from octoseg_ti.view.stream import replaced
 
@@ -107,18 +100,9 @@ def _measured(result: Segmentation) -> Section:
             ("spacing across the stripes", f"{m.spacing_across:.4g} mm"),
             ("range noise (standard deviation)", f"{m.noise:.4g} mm"),
             ("deviation of the normals", f"{math.degrees(m.normal_noise):.3g} deg"),
-            *_shallowest(result),
+            *([] if math.isnan(result.shallowest_edge) else [result.told_edges()]),
         ],
     )
-
-
-def _shallowest(result: Segmentation) -> list[tuple[str, str]]:
-    angle = math.degrees(result.shallowest_edge)
-    if math.isnan(angle):
-        return []
-    hidden = "; the noise hides shallower ones" if angle > SHALLOW_EDGE else ""
-    width = f"{result.edge_width:.3g} mm"
-    return [(f"edges between faces {width} wide are told from", f"{angle:.2g} deg on{hidden}")]
 
 
 def _registration(aligned: Registration) -> Section:
