@@ -399,9 +399,9 @@ class Segmentation:
         """Angle above which an edge between two faces is told from a bend [rad].
 
         Two faces that meet at a shallow angle look like one that is bent. How far they are from it
-        has to stand out from ``surfaces.noise``, and grows with the angle and the width: faces twice
-        as wide as `edge_width` show half of this angle. Between it and about a third of it edges
-        are found by chance. NaN where no surfaces were looked for.
+        has to stand out from ``surfaces.noise``, and grows with the angle and the width: faces
+        twice as wide as `edge_width` show half of this angle. Between it and about a third of it
+        edges are found by chance. NaN where no surfaces were looked for.
         """
         noise, width = self.params.surfaces.noise, self.edge_width
         if not self.params.surfaces.enabled or noise is None or not width > 0.0:
