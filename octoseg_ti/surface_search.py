@@ -20,12 +20,14 @@ from octoseg_ti.stages.labelling import (
     Labelling,
     Rule,
     common_label,
+    label_lists,
     own_lists,
     surface_table,
 )
 from octoseg_ti.stages.leaves import (
     Leaves,
     Samples,
+    joined_samples,
     members_of,
     sample_leaves,
 )
@@ -36,12 +38,15 @@ from octoseg_ti.stages.merging import (
     smooth_contacts,
 )
 from octoseg_ti.stages.sets import Surfaces, fit_sets, lie_on, no_surfaces, spread
+from octoseg_ti.stages.settling import settle
 from octoseg_ti.types import NONE
 
 NARROW = 2.0
 """Normals of narrow faces, and of points at edges, may be off so many times more than others."""
 
 _ROUNDS = 2
+# Points within so many smallest cells tell on which of two surfaces one lies.
+_AROUND_POINT = 2.0
 # Points of a leaf that speak for it: of all its points, and of those that fit nothing.
 _SAMPLES, _REST = 4, 6
 # ... and with the points around those; what these count.
@@ -50,6 +55,8 @@ _AROUND, _HARDLY = 12, 1e-3
 _LEFT_POINTS, _LEFT_SHARE = 2, 3
 # Samples for fitting a surface anew.
 _REFIT = 300
+# ... and in the end, when it is settled which points are its own; of one leaf at most.
+_SETTLED, _DENSE = 1000, 32
 # ... away from other surfaces, if there are so many of these.
 _INNER = 40
 # A surface is given up when its neighbours explain its points with this mean square, in noises.
@@ -82,6 +89,8 @@ class _Search:
         self.surfaces = no_surfaces()
         self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
         self.labelling = Labelling(grid, leaves, rule)
+        self._label: np.ndarray | None = None
+        self.settled = False
         # Pairs of surfaces that were found not to be one.
         self.apart = np.zeros(0, np.int64)
         # Surfaces found in what others left have to be clearly better where others fit.
@@ -94,13 +103,23 @@ class _Search:
     @property
     def label(self) -> np.ndarray:
         """Return the label of every sorted point."""
-        return runtime.download(self.labelling.choice.label)
+        if self._label is None and not self.settled:
+            self._label = runtime.download(self.labelling.choice.label)
+        elif self._label is None:
+            self._label = settle(
+                self.grid.point, self.leaves, *self.labelling.choice,
+                surface_table(self.surfaces.kind, self.surfaces.parameters),
+                reach=_AROUND_POINT * float(self.leaves.size.min()),
+                farthest=self.labelling.rule.reach,
+            )  # fmt: skip
+        return self._label
 
     def choose(self, passes: int = 1, *, closed: bool = True) -> None:
         """Let the points choose among the surfaces near them; those of free forms where asked."""
         late = np.arange(len(self.surfaces)) >= self.early
         table = surface_table(self.surfaces.kind, self.surfaces.parameters, _HANDICAP * late)
         free = self.free if closed else None
+        self._label = None
         self.own = self.labelling.choose(self.own, table, passes=passes, closed=free)
 
     def open_seams(self) -> None:
@@ -160,12 +179,35 @@ class _Search:
             i if len(i) >= _INNER and 4 * len(i) >= len(m) else m
             for i, m in zip(inner, members, strict=True)
         ]
+        self.fit_to(self.samples, [spread(m, _REFIT) for m in members])
+
+    def refit_settled(self) -> None:
+        """Fit the surfaces to more of their points, up to the edges: these are settled now.
+
+        What chose a surface for being near it would pull it away from the edge.
+        """
+        self.settled = True
+        self._label = None
+        count = len(self.surfaces)
+        label = self.label
+        of = label[self.samples.index]
+        few = np.append(np.bincount(of[of >= 0], minlength=count) < _SETTLED, False)
+        # Where leaves are large, their few samples are less than there could be.
+        more = sample_leaves(
+            self.grid, self.leaves, _DENSE, label=np.where(few[label], NONE, 0).astype(np.int32)
+        )
+        both = joined_samples(self.samples, more)
+        name = np.concatenate([np.where(few[of], NONE, of), label[more.index]])
+        self.fit_to(both, [spread(m, _SETTLED) for m in members_of(name, count)])
+
+    def fit_to(self, samples: Samples, members: list[np.ndarray]) -> None:
+        """Fit the surfaces to samples, one set for each, where that explains them no worse."""
         which = np.array([m for m, s in enumerate(members) if len(s) >= 10], np.int64)
-        sets = [spread(members[m], _REFIT) for m in which]
+        sets = [members[m] for m in which]
         noise = self.tolerance.noise
-        fitted, fits = fit_sets(self.samples, sets, noise, robust=True)
-        new = lie_on(self.samples, sets, fitted, fits, 3.0 * noise, 0.5)
-        old = lie_on(self.samples, sets, fitted, self.surfaces.at(which[fitted]), 3.0 * noise, 0.5)
+        fitted, fits = fit_sets(samples, sets, noise, robust=True)
+        new = lie_on(samples, sets, fitted, fits, 3.0 * noise, 0.5)
+        old = lie_on(samples, sets, fitted, self.surfaces.at(which[fitted]), 3.0 * noise, 0.5)
         kind, parameters = self.surfaces.kind.copy(), self.surfaces.parameters.copy()
         for k, f in enumerate(fitted):
             if new[k].mean() >= old[k].mean() - 0.01:
@@ -237,13 +279,10 @@ class _Search:
 
     def give_up(self) -> bool:
         """Give up surfaces that their neighbours explain; say whether there were any."""
-        gone = explained_by_others(
-            self.label,
-            runtime.download(self.labelling.choice.second),
-            runtime.download(self.labelling.choice.off),
-            len(self.surfaces),
-            _EXPLAINED,
-        )
+        off = runtime.download(self.labelling.choice.off)
+        second = runtime.download(self.labelling.choice.second)
+        second = np.where(off[:, 1] * self.labelling.rule.tilt <= self.labelling.rule.turn, second, NONE)
+        gone = explained_by_others(self.label, second, off, len(self.surfaces), _EXPLAINED)
         if not gone.any():
             return False
         name = np.where(gone, NONE, np.arange(len(gone)))
@@ -319,8 +358,11 @@ def find_surfaces(
             break
     search.early = len(search.surfaces)
     search.choose()
+    search.refit_settled()
+    search.choose()
     search.give_up_slivers()
-    return Surfaced(surfaces=search.surfaces, label=search.label, own=search.own)
+    own = label_lists(leaves, search.label)
+    return Surfaced(surfaces=search.surfaces, label=search.label, own=own)
 
 
 def _sets_of(samples: Samples, leaves: Leaves, group: np.ndarray, least: float) -> list[np.ndarray]:

@@ -14,6 +14,7 @@ from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import Labelling, Rule, common_label, label_lists, surface_table
 from octoseg_ti.stages.leaves import Leaves, leaf_graph, without_gaps
 from octoseg_ti.stages.merging import pieces
+from octoseg_ti.stages.settling import settle
 from octoseg_ti.surface_search import NARROW, Surfaced, find_surfaces
 from octoseg_ti.types import NONE
 
@@ -64,7 +65,13 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         labelling = Labelling(grid, graph, loose)
         full = ~np.logical_or.reduceat(label < 0, graph.first)
         labelling.choose(own, table, closed=full)
-        label = np.where(label < 0, runtime.download(labelling.choice.label), label)
+        chosen_now, second, off = labelling.choice
+        second = np.where(label < 0, runtime.download(second), NONE)
+        label = np.where(label < 0, runtime.download(chosen_now), label)
+        label = settle(
+            grid.point, graph, runtime.upload(label.astype(np.int32)), runtime.upload(second), off,
+            table, reach=2.0 * float(graph.size.min()), farthest=loose.reach,
+        )
     held = np.full(grid.count, NONE, np.int32)
     held[leaves] = common_label(graph, label)
     return replace(

@@ -19,6 +19,7 @@ from octoseg_ti.stages.sets import (
     fit_sets,
     joined,
     lie_on,
+    nearness,
     no_surfaces,
     spread,
 )
@@ -215,7 +216,7 @@ def _find_candidates(samples: Samples, work: list[_Set], tolerance: Tolerance) -
         w.scored = spread(np.flatnonzero(w.free), _SCORED)
     scored = [w.members[w.scored] for w in work]
     limit = _ON * tolerance.noise
-    on = lie_on(samples, scored, owner, surfaces, limit, tolerance.turn)
+    on = nearness(samples, scored, owner, surfaces, limit, tolerance.turn)
     for s, w in enumerate(work):
         mine = np.flatnonzero(owner == s)
         w.surfaces = surfaces.at(mine)

@@ -40,10 +40,11 @@ class Choice(NamedTuple):
     label: Any
     """Surface of every sorted point, -1 = none fits, shape (n,), i32 (kernel array)."""
     second: Any
-    """Surface that would come next, -1 = none near, shape (n,), i32 (kernel array)."""
+    """Surface that would come next, however far off or turned, -1 = none near, shape (n,), i32
+    (kernel array)."""
     off: Any
-    """Distance of every point from its second [noises], and the angle between their normals
-    [tilts], shape (n, 2), f32 (kernel array)."""
+    """Distance of every point from its second [noises], the angle between their normals [tilts],
+    and by how much that costs more than its own, shape (n, 3), f32 (kernel array)."""
 
 
 @ti.func
@@ -128,20 +129,21 @@ def _choose(
                     # the one that it faces a little.
                     tilt = ti.min(turn, 6.0 + 0.1 * ti.max(turn - 6.0, 0.0))
                     this = vec3(least + tilt * tilt, off, turn)
-                    if angle <= rule[3]:
-                        if off <= rule[2] and this[0] < best[0]:
+                    if angle <= rule[3] and off <= rule[2] and this[0] < best[0]:
+                        if best[0] < after[0]:
                             after = best
                             second = label
-                            best = this
-                            label = s
-                        elif this[0] < after[0]:
-                            after = this
-                            second = s
+                        best = this
+                        label = s
+                    elif this[0] < after[0]:
+                        after = this
+                        second = s
                 k += 1
             label_inout[i] = label
             second_inout[i] = second
             off_inout[i, 0] = ti.cast(after[1], ti.f32)
             off_inout[i, 1] = ti.cast(after[2], ti.f32)
+            off_inout[i, 2] = ti.cast(after[0] - best[0], ti.f32)
             if label >= 0:
                 _insert(own_inout, c, label)
 
@@ -247,7 +249,7 @@ class Labelling:
         self.choice = Choice(
             runtime.empty(n, np.int32),
             runtime.empty(n, np.int32),
-            runtime.empty((n, 2), np.float32),
+            runtime.empty((n, 3), np.float32),
         )
         self._start, self._neighbor = runtime.upload(leaves.start), runtime.upload(leaves.neighbor)
         self._leaf = runtime.upload(np.stack([leaves.first, leaves.count], axis=1))

@@ -225,6 +225,18 @@ def sample_leaves(
     )
 
 
+def joined_samples(one: Samples, other: Samples) -> Samples:
+    """Return samples of the same leaves in one list."""
+    return Samples(
+        index=np.concatenate([one.index, other.index]),
+        leaf=np.concatenate([one.leaf, other.leaf]),
+        point=np.concatenate([one.point, other.point]),
+        normal=np.concatenate([one.normal, other.normal]),
+        weight=np.concatenate([one.weight, other.weight]),
+        signed=one.signed,
+    )
+
+
 def distinct(key: np.ndarray) -> np.ndarray:
     """Return the different keys, ascending: faster than `numpy.unique`, which hashes them."""
     key = np.sort(key)

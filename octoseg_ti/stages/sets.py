@@ -6,7 +6,7 @@ import numpy as np
 
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row
-from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
+from octoseg_ti.device.runtime import F32Array, F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.surfaces import KINDS, evaluate_surfaces, surface_in_row
 from octoseg_ti.fitting.primitives import fit_all
 from octoseg_ti.fitting.quadrics import fit_quadrics
@@ -18,6 +18,8 @@ from octoseg_ti.types import SurfaceKind
 _FIT = 1.5
 # Distances beyond this many noises count as this many.
 _CAP = 4.0
+# What a sample at the limit counts.
+_LEAST = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -70,19 +72,20 @@ def _lie_on(
     surface_in: F64Rows,
     range_in: I32Rows,
     # Out:
-    on_out: I32Array,
+    near_out: F32Array,
 ):
-    """Say for every surface which samples of its range lie on it."""
+    """Say for every surface how near it the samples of its range lie, 0 where they do not."""
     for s in range(range_in.shape[0]):
         kind = ti.cast(surface_in[s, 8], ti.i32)
         for j in range(range_in[s, 0], range_in[s, 1]):
             i = sample_in[j]
             d, n = surface_in_row(surface_in, s, kind, row(point_in, i))
             m = row(normal_in, i)
-            on = ti.cast(ti.abs(d) <= limit, ti.i32)
+            share = d / limit
+            near = ti.select(ti.abs(d) <= limit, ti.max(1.0 - share * share, _LEAST), 0.0)
             if ti.abs(n.dot(m)) < cosine and m.norm_sqr() > 0.0:
-                on = 0
-            on_out[range_in[s, 2] + j - range_in[s, 0]] = on
+                near = 0.0
+            near_out[range_in[s, 2] + j - range_in[s, 0]] = ti.cast(near, ti.f32)
 
 
 def lie_on(
@@ -93,7 +96,23 @@ def lie_on(
     limit: float,
     turn: float,
 ) -> list[np.ndarray]:
-    """Return for every surface which samples of a set lie on it.
+    """Return for every surface which samples of a set lie on it, as `nearness` does, but bool."""
+    return [near > 0.0 for near in nearness(samples, sets, which, surfaces, limit, turn)]
+
+
+def nearness(
+    samples: Samples,
+    sets: list[np.ndarray],
+    which: np.ndarray,
+    surfaces: Surfaces,
+    limit: float,
+    turn: float,
+) -> list[np.ndarray]:
+    """Return for every surface how near it the samples of a set lie.
+
+    Samples of the surface are mostly much nearer than the limit. What a surface merely cuts through
+    is anywhere within it, so that the sum tells more than the number (MSAC, Torr and Zisserman
+    2000).
 
     Args:
         samples: The samples.
@@ -104,7 +123,8 @@ def lie_on(
         turn: Largest angle between the normals [rad].
 
     Returns:
-        Whether each sample of the set lies on the surface, an array of bool for every surface.
+        1 less the square of the distance in limits, and 0 where a sample does not lie on the
+        surface: an array of f32 for every surface.
     """
     runtime.ensure_started()
     if len(surfaces) == 0:
@@ -113,7 +133,7 @@ def lie_on(
     begin = np.cumsum(length) - length
     out = np.cumsum(length[which]) - length[which]
     ranges = np.stack([begin[which], begin[which] + length[which], out], axis=1).astype(np.int32)
-    on = runtime.empty(int(length[which].sum()), np.int32)
+    near = runtime.empty(int(length[which].sum()), np.float32)
     _lie_on(
         limit,
         float(np.cos(min(turn, np.pi / 2))),
@@ -122,9 +142,9 @@ def lie_on(
         runtime.upload(np.concatenate(sets).astype(np.int32)),
         runtime.upload(np.column_stack([surfaces.parameters, surfaces.kind])),
         runtime.upload(ranges),
-        on,
+        near,
     )
-    found = runtime.download(on).astype(bool)
+    found = runtime.download(near)
     return [found[o : o + n] for o, n in zip(out, length[which], strict=True)]
 
 
