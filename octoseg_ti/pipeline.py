@@ -114,6 +114,8 @@ def segment(
             found = without_mirror_images(grid, leaves, found, arranged, probe)
     with stage("borders"):
         borders = trace_borders(scans, arranged, point, probe, grid, found, measured, params)
+        if borders is not None:
+            found = replace(found, label=borders.label)
     with stage("patches"):
         result = assemble(
             scans, arranged, point, normal, grid, leaves, found, borders, measured, params

@@ -20,6 +20,8 @@ from octoseg_ti.types import NONE
 
 ON = 3.5
 """A point lies on a ball within so many noises."""
+WEAK = 2.0
+"""A point so many noises from the surface of its patch lies on that."""
 
 # Points of the zone of an edge that are looked at, that the radius is fitted to, and that radii are
 # tried on; each of these is larger than the last by the ratio.
@@ -39,7 +41,6 @@ _SHARED = 2.0  # neighbours share some of their noise, and the sides are not kno
 # so many noises.
 _WORSE, _EVEN = 1.2, 0.3
 _FRESH = 0.5  # ... and this share of its points is on no better one
-_WEAK = 2.0  # a point so many noises from the surface of its patch lies on that
 _STRIP_SHARE = 0.5  # a patch is the strip of a fillet when so much of it is claimed
 _REFIT = 300
 
@@ -172,7 +173,7 @@ def drop_weak_claims(search: Search, zones: Zones, fit: Fit) -> None:
     mine = np.flatnonzero(search.claim >= 0)
     pair = search.claim[mine]
     side = (search.label[mine][:, None] == zones.pairs[pair]).any(axis=1)
-    weak = side & (search.off[mine] <= _WEAK * search.noise)
+    weak = side & (search.off[mine] <= WEAK * search.noise)
     mark = search.claim.copy()
     mark[mine[weak]] = NONE
     mine, pair = mine[weak], pair[weak]

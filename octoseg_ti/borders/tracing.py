@@ -16,9 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octoseg_ti.borders.fillets import ON, Fit, claim_points, fit_balls, refit_sides, strips_of
+from octoseg_ti.borders.fillets import ON, WEAK, Fit, claim_points, fit_balls, refit_sides, strips_of
 from octoseg_ti.borders.rims import mark_rims
 from octoseg_ti.borders.zones import CAP, EDGE, Search, Zones, find_zones, ranges
+from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.stages.marking import nearest_marked
 from octoseg_ti.stages.profiles import BALL
 from octoseg_ti.stages.rims import Lines
@@ -33,6 +34,9 @@ _SMOOTH = 0.09  # surfaces that meet at a smaller angle [rad] meet smoothly, if 
 class Borders:
     """What borders of patches were found, ``F`` fillets."""
 
+    label: np.ndarray
+    """Patch of every sorted point, shape (n,), i32: where the strip of a fillet runs into a side,
+    its points belong to that."""
     edge: np.ndarray
     """`EdgeClass` of every sorted point, shape (n,), u8."""
     fillet: np.ndarray
@@ -68,14 +72,45 @@ def find_borders(search: Search, lines: Lines | None = None) -> Borders:
     edge = mark_points(search, zones, fit, chosen, strip)
     if lines is not None:
         mark_rims(search, lines, edge)
+    sides = zones.pairs[fillets].astype(np.int32)
     return Borders(
+        label=give_back(search, strip, sides),
         edge=edge,
         fillet=number[search.claim],
-        sides=zones.pairs[fillets].astype(np.int32),
+        sides=sides,
         radius=fit.radius[fillets],
         deviation=fit.deviation[fillets],
         strip=strip,
     )
+
+
+def give_back(search: Search, strip: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """Return the patch of every point, those of strips that lie on a side as well given to that.
+
+    Next to the line of contact nothing tells the strip from the side, up to where the strip has
+    left it by twice the noise: there the side goes on, as a face is what a part is measured by.
+    """
+    label = search.label
+    mine = np.flatnonzero(np.append(strip, NONE)[label] >= 0)
+    mine = mine[search.analytic[label[mine]]]
+    point, own = search.points[mine], label[mine]
+    kind, parameters = search.table[:, 8].astype(np.int32), search.table[:, :8]
+    # Where the point is on the strip: its own error has no say.
+    far, outward = evaluate_surfaces(point, own, kind, parameters)
+    foot = point - far[:, None] * outward
+    both = sides[strip[own]]
+    gap = np.stack(
+        [np.abs(evaluate_surfaces(foot, both[:, k], kind, parameters)[0]) for k in range(2)], axis=1
+    )
+    nearer, least = gap.argmin(axis=1), gap.min(axis=1)
+    # Of a narrow strip the middle stays.
+    reach = np.full(search.count, WEAK * search.noise)
+    for patch in np.unique(own):
+        reach[patch] = min(reach[patch], np.median(least[own == patch]))
+    weak = least <= reach[own]
+    label = label.copy()
+    label[mine[weak]] = both[weak, nearer[weak]]
+    return label
 
 
 def mark_points(
