@@ -24,8 +24,8 @@ _FEW = 10
 _EDGE = 0.7
 _UNIT = 1024.0
 # What deviates by no more than this many noises and tilts, and is no larger than this share of the
-# surface beside it, is an error of its form.
-_FORM, _SMOOTH, _SMALL = 4.0, 3.0, 0.25
+# surface beside it, is an error of its form: of that one, and no round between it and the next.
+_FORM, _SMOOTH, _SMALL, _LEANS = 4.0, 3.0, 0.25, 0.8
 # What is cut out of something else as far as it just fits leaves 1.44 noises, evenly spread within
 # 2.5; a surface leaves 1 at most, and two thirds where the noise is taken large to be safe.
 _CUT_OUT = 1.1
@@ -198,6 +198,7 @@ def explained_by_others(
         main = int(heir[np.argmax(points[lo:hi])])
         form = (
             main != m
+            and points[lo:hi].max() >= _LEANS * size[m]
             and deviation[m] <= _FORM**2
             and turn[m] <= _SMOOTH**2
             and size[m] <= _SMALL * size[main]
