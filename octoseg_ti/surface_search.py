@@ -43,6 +43,11 @@ from octoseg_ti.types import NONE
 
 NARROW = 2.0
 """Normals of narrow faces, and of points at edges, may be off so many times more than others."""
+EXPLAINED = 2.0
+"""A surface is given up when its neighbours explain its points with this mean square, in noises."""
+
+FREE = 10.0
+"""A free form has at least this many times the points of the smallest patch."""
 
 _ROUNDS = 2
 # Points within so many smallest cells tell on which of two surfaces one lies.
@@ -59,13 +64,9 @@ _REFIT = 300
 _SETTLED, _DENSE = 1000, 32
 # ... away from other surfaces, if there are so many of these.
 _INNER = 40
-# A surface is given up when its neighbours explain its points with this mean square, in noises.
-_EXPLAINED = 2.0
 _MERGES = 8
 # By how much the cost of a surface found late must be lower, in squares of noises.
 _HANDICAP = 2.0
-# A free form has at least this many times the points of the smallest patch.
-_FREE = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,6 +79,9 @@ class Surfaced:
     """Surface of every sorted point, -1 = none, shape (n,), i32."""
     own: np.ndarray
     """Surfaces with points in every leaf, ascending, then -1; shape (C, most), i32."""
+    off: np.ndarray
+    """Distance of every point from the surface that would be next [noises], shape (n,), f32; a
+    large one where there is none."""
 
 
 class _Search:
@@ -149,7 +153,7 @@ class _Search:
         sets = [s for s in sets if 2 * np.count_nonzero(samples.normal[s].any(axis=1)) > len(s)]
         new, label = explain(samples, self.leaves, sets, tolerance, apart=apart)
         for members in sets:
-            large = samples.weight[members].sum() >= _FREE * self.tolerance.points
+            large = samples.weight[members].sum() >= FREE * self.tolerance.points
             explained = np.any(label[members] >= 0)
             if large or explained:
                 self.free[samples.leaf[members]] = not explained
@@ -282,7 +286,7 @@ class _Search:
         off = runtime.download(self.labelling.choice.off)
         second = runtime.download(self.labelling.choice.second)
         second = np.where(off[:, 1] * self.labelling.rule.tilt <= self.labelling.rule.turn, second, NONE)
-        gone = explained_by_others(self.label, second, off, len(self.surfaces), _EXPLAINED)
+        gone = explained_by_others(self.label, second, off, len(self.surfaces), EXPLAINED)
         if not gone.any():
             return False
         name = np.where(gone, NONE, np.arange(len(gone)))
@@ -290,11 +294,18 @@ class _Search:
         self.choose()
         return True
 
+    def off_next(self) -> np.ndarray:
+        """Return how far every point is from the surface that would be next [noises]."""
+        chosen, _, off = self.labelling.choice
+        # Where its surroundings decided, that is the one which the point chose itself.
+        moved = self.label != runtime.download(chosen)
+        return np.where(moved, 1.0, runtime.download(off)[:, 0]).astype(np.float32)
+
     def give_up_slivers(self) -> None:
         """Give up small surfaces that were cut out of the ragged rim of something else."""
         label = self.label
         size = np.bincount(label[label >= 0], minlength=len(self.surfaces))
-        small = size < _FREE * self.tolerance.points
+        small = size < FREE * self.tolerance.points
         here = np.flatnonzero(np.append(small, False)[label])
         if len(here) == 0:
             return
@@ -360,9 +371,14 @@ def find_surfaces(
     search.choose()
     search.refit_settled()
     search.choose()
+    search.give_up()
     search.give_up_slivers()
-    own = label_lists(leaves, search.label)
-    return Surfaced(surfaces=search.surfaces, label=search.label, own=own)
+    return Surfaced(
+        surfaces=search.surfaces,
+        label=search.label,
+        own=label_lists(leaves, search.label),
+        off=search.off_next(),
+    )
 
 
 def _sets_of(samples: Samples, leaves: Leaves, group: np.ndarray, least: float) -> list[np.ndarray]:

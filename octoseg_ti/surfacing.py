@@ -15,7 +15,7 @@ from octoseg_ti.stages.labelling import Labelling, Rule, common_label, label_lis
 from octoseg_ti.stages.leaves import Leaves, leaf_graph, without_gaps
 from octoseg_ti.stages.merging import pieces
 from octoseg_ti.stages.settling import settle
-from octoseg_ti.surface_search import NARROW, Surfaced, find_surfaces
+from octoseg_ti.surface_search import EXPLAINED, FREE, NARROW, Surfaced, find_surfaces
 from octoseg_ti.types import NONE
 
 # Positions are exact, and tell by themselves, where a surface needs no more than this share of the
@@ -23,6 +23,8 @@ from octoseg_ti.types import NONE
 _ALONE = 0.33
 # Points of one piece of a surface are linked over so many times the longest distance of neighbours.
 _GAPS = 2.0
+# Distances beyond this many noises count as this many; whole units add up alike in any order.
+_CAP, _UNIT = 4.0, 1024.0
 # A point that fits nothing joins a patch within so many times the usual reach.
 _LOOSE = 3.0
 
@@ -108,7 +110,7 @@ def _with_free_forms(
     # Nothing tells a small surface within a free form from a part of it.
     size = np.bincount(label[label >= 0], minlength=len(surface))
     within = np.bincount(label[(label >= 0) & np.isin(found.label, stay)], minlength=len(surface))
-    kept = (size >= least) | (2 * within < size)
+    kept = (size >= FREE * least) | (2 * within < size)
     number = np.full(len(surface) + 1, NONE, np.int32)
     number[:-1][kept] = np.arange(np.count_nonzero(kept), dtype=np.int32)
     label, surface = number[label], surface[kept]
@@ -125,7 +127,7 @@ def number_pieces(
     Args:
         leaves: The leaves.
         found: The surfaces and their points.
-        least: A piece with fewer points is no patch,
+        least: A piece with fewer points is no patch, nor is one that other surfaces explain,
         fewest: unless it is the largest of its surface and has so many.
 
     Returns:
@@ -144,7 +146,11 @@ def number_pieces(
     np.maximum.at(most, name, size[mine])
     main = np.zeros(len(size), bool)
     main[mine] = size[mine] == most[name]
-    names = np.flatnonzero(size >= np.where(main, max(fewest, 1), max(least, 1)))
+    # Where surfaces touch smoothly one goes on within the other, and gets some of its points.
+    square = np.rint(_UNIT * np.minimum(found.off[there], _CAP) ** 2)
+    within = np.bincount(mine, square, len(size)) <= _UNIT * EXPLAINED * size
+    kept = size >= np.where(main, max(fewest, 1), max(least, 1))
+    names = np.flatnonzero(kept & (main | ~within))
     names = names[np.argsort(-size[names], kind="stable")]
     number = np.full(len(size), NONE, np.int32)
     number[names] = np.arange(len(names), dtype=np.int32)

@@ -94,11 +94,12 @@ def give_back(search: Search, strip: np.ndarray, sides: np.ndarray) -> np.ndarra
     mine = np.flatnonzero(np.append(strip, NONE)[label] >= 0)
     mine = mine[search.analytic[label[mine]]]
     point, own = search.points[mine], label[mine]
-    kind, parameters = search.table[:, 8].astype(np.int32), search.table[:, :8]
     # Where the point is on the strip: its own error has no say.
+    kind, parameters = search.given[:, 8].astype(np.int32), search.given[:, :8]
     far, outward = evaluate_surfaces(point, own, kind, parameters)
     foot = point - far[:, None] * outward
     both = sides[strip[own]]
+    kind, parameters = search.table[:, 8].astype(np.int32), search.table[:, :8]
     gap = np.stack(
         [np.abs(evaluate_surfaces(foot, both[:, k], kind, parameters)[0]) for k in range(2)], axis=1
     )

@@ -100,6 +100,8 @@ class Search:
         if len(surfaces):
             self.table[:, :8], self.table[:, 8] = surfaces.parameters[which], surfaces.kind[which]
         self.table[~self.analytic] = 0.0
+        # The surfaces as they came; in the table they change when fillets are known.
+        self.given = self.table.copy()
         self.set_sides()
         # Distance of every point from the surface of its patch [mm], capped.
         self.off = np.full(len(label), CAP * noise)
