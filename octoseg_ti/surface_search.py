@@ -46,12 +46,12 @@ NARROW = 2.0
 EXPLAINED = 2.0
 """A surface is given up when its neighbours explain its points with this mean square, in noises."""
 
+AROUND = 2.0
+"""Points within so many smallest cells tell on which of two surfaces one lies."""
 FREE = 10.0
 """A free form has at least this many times the points of the smallest patch."""
 
 _ROUNDS = 2
-# Points within so many smallest cells tell on which of two surfaces one lies.
-_AROUND_POINT = 2.0
 # Points of a leaf that speak for it: of all its points, and of those that fit nothing.
 _SAMPLES, _REST = 4, 6
 # ... and with the points around those; what these count.
@@ -113,7 +113,7 @@ class _Search:
             self._label = settle(
                 self.grid.point, self.leaves, *self.labelling.choice,
                 surface_table(self.surfaces.kind, self.surfaces.parameters),
-                reach=_AROUND_POINT * float(self.leaves.size.min()),
+                reach=AROUND * float(self.leaves.size.min()),
                 farthest=self.labelling.rule.reach,
             )  # fmt: skip
         return self._label

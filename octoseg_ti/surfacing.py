@@ -15,7 +15,7 @@ from octoseg_ti.stages.labelling import Labelling, Rule, common_label, label_lis
 from octoseg_ti.stages.leaves import Leaves, leaf_graph, without_gaps
 from octoseg_ti.stages.merging import pieces
 from octoseg_ti.stages.settling import settle
-from octoseg_ti.surface_search import EXPLAINED, FREE, NARROW, Surfaced, find_surfaces
+from octoseg_ti.surface_search import AROUND, EXPLAINED, FREE, NARROW, Surfaced, find_surfaces
 from octoseg_ti.types import NONE
 
 # Positions are exact, and tell by themselves, where a surface needs no more than this share of the
@@ -56,24 +56,14 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
     near = graph if gap is None else without_gaps(grid, graph, _GAPS * gap)
     label, surface = number_pieces(near, surfaced, least, fewest)
     label, surface, free = _with_free_forms(label, surface, found, least)
-    # What is left joins the nearest patch, within reason.
-    if np.any(label < 0) and len(surface):
+    if len(surface):
         table = surface_table(
-            surfaced.surfaces.kind[surface],
-            surfaced.surfaces.parameters[surface],
+            surfaced.surfaces.kind[surface], surfaced.surfaces.parameters[surface]
         )
-        loose = rule._replace(reach=_LOOSE * rule.reach, turn=float(np.pi))
-        own = label_lists(graph, np.where(label < len(surface), label, NONE))
-        labelling = Labelling(grid, graph, loose)
-        full = ~np.logical_or.reduceat(label < 0, graph.first)
-        labelling.choose(own, table, closed=full)
-        chosen_now, second, off = labelling.choice
-        second = np.where(label < 0, runtime.download(second), NONE)
-        label = np.where(label < 0, runtime.download(chosen_now), label)
-        label = settle(
-            grid.point, graph, runtime.upload(label.astype(np.int32)), runtime.upload(second), off,
-            table, reach=2.0 * float(graph.size.min()), farthest=loose.reach,
-        )
+        # What is left joins the nearest patch: with any normal, as edges have, or somewhat farther
+        # off. What is neither near nor faces that way is something else.
+        label = _join(grid, graph, label, table, rule._replace(turn=float(np.pi)))
+        label = _join(grid, graph, label, table, rule._replace(reach=_LOOSE * rule.reach))
     held = np.full(grid.count, NONE, np.int32)
     held[leaves] = common_label(graph, label)
     return replace(
@@ -86,6 +76,36 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         parameters=surfaced.surfaces.parameters,
         graph=graph,
     )
+
+
+def _join(
+    grid: Grid, graph: Leaves, label: np.ndarray, table: np.ndarray, rule: Rule
+) -> np.ndarray:
+    """Let the points without a patch choose one near them.
+
+    Args:
+        grid: The sparse grid.
+        graph: Its leaves.
+        label: Patch of every sorted point, -1 = none, shape (n,), i32.
+        table: The surfaces of the first patches; the others are free forms.
+        rule: What a point may differ from its surface.
+
+    Returns:
+        As ``label``.
+    """
+    left = label < 0
+    if not left.any():
+        return label
+    own = label_lists(graph, np.where(label < len(table), label, NONE))
+    labelling = Labelling(grid, graph, rule)
+    labelling.choose(own, table, closed=~np.logical_or.reduceat(left, graph.first))
+    chosen, second, off = labelling.choice
+    label = np.where(left, runtime.download(chosen), label).astype(np.int32)
+    second = np.where(left, runtime.download(second), NONE).astype(np.int32)
+    return settle(
+        grid.point, graph, runtime.upload(label), runtime.upload(second), off, table,
+        reach=AROUND * float(graph.size.min()), farthest=rule.reach,
+    )  # fmt: skip
 
 
 def _with_free_forms(
