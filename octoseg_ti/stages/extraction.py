@@ -23,7 +23,7 @@ from octoseg_ti.stages.sets import (
     no_surfaces,
     spread,
 )
-from octoseg_ti.types import NONE
+from octoseg_ti.types import NONE, SurfaceKind
 
 # A sample lies on a surface within this many noises.
 _ON = 3.0
@@ -106,6 +106,12 @@ def explain(
         sure[s] = likely[s] and rms <= _SURE * noise
     rest = list(compress(sets, ~sure)) if apart else []
     more, found = _take_apart(samples, leaves, rest, tolerance)
+    # Where that gave nothing real, curved surfaces may have cut through facets.
+    again = [s for s in rest if not np.any(found[s] >= 0)]
+    if again:
+        finer, there = _take_apart(samples, leaves, again, tolerance, flat=True)
+        found = np.where(there >= 0, there + len(more), found)
+        more = more.joined(finer)
     kept: list[int] = []
     for m, (s, there) in enumerate(zip(fitted, on, strict=True)):
         if likely[s] and not np.any(found[sets[s]] >= 0):
@@ -224,29 +230,43 @@ def _find_candidates(samples: Samples, work: list[_Set], tolerance: Tolerance) -
 
 
 def _take_apart(
-    samples: Samples, leaves: Leaves, sets: list[np.ndarray], tolerance: Tolerance
+    samples: Samples,
+    leaves: Leaves,
+    sets: list[np.ndarray],
+    tolerance: Tolerance,
+    *,
+    flat: bool = False,
 ) -> tuple[Surfaces, np.ndarray]:
-    """Find the surfaces of sets that no single one explains."""
+    """Find the surfaces, or just the planes, of sets that no single one explains."""
     label = np.full(len(samples), NONE, np.int32)
     found = no_surfaces()
     active = [_Set(samples, leaves, members, tolerance.points) for members in sets]
     while active:
         _find_candidates(samples, active, tolerance)
+        if flat:
+            for w in active:
+                w.on[w.surfaces.kind != SurfaceKind.PLANE] = 0.0
         gained: dict[_Set, None] = {}
         going = active
         while going:
             wave = [(w, c) for w in going for c in w.best(tolerance.points)]
             start = [w.surfaces.at(np.array([c])) for w, c in wave]
             taken: dict[_Set, None] = {}
+            again: dict[_Set, None] = {}
             for k, surface, part in _grow(samples, [w for w, _ in wave], start, tolerance):
                 w, size = wave[k][0], wave[k][0].weight[part].sum()
                 left = part & w.free
-                if w.weight[left].sum() >= max(_KEPT * size, tolerance.points):
-                    label[w.members[left]] = len(found)
-                    found = found.joined(surface)
-                    w.take(left)
-                    taken[w] = None
-            going = [w for w in taken if not w.ended(tolerance.points)]
+                if w.weight[left].sum() < max(_KEPT * size, tolerance.points):
+                    continue
+                again[w] = None
+                if flat and surface.kind[0] != SurfaceKind.PLANE:
+                    w.on[wave[k][1]] = 0.0
+                    continue
+                label[w.members[left]] = len(found)
+                found = found.joined(surface)
+                w.take(left)
+                taken[w] = None
+            going = [w for w in again if not w.ended(tolerance.points)]
             gained |= taken
         active = [w for w in gained if w.seeds > 0 and not w.ended(tolerance.points)]
     return _real_ones(samples, sets, found, label, tolerance.noise, tolerance.exact)

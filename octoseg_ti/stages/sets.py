@@ -83,8 +83,10 @@ def _lie_on(
             m = row(normal_in, i)
             share = d / limit
             near = ti.select(ti.abs(d) <= limit, ti.max(1.0 - share * share, _LEAST), 0.0)
-            if ti.abs(n.dot(m)) < cosine and m.norm_sqr() > 0.0:
-                near = 0.0
+            if m.norm_sqr() > 0.0:
+                facing = ti.abs(n.dot(m))
+                turned = (1.0 - facing) / (1.0 - cosine)
+                near = ti.select(facing >= cosine, ti.max(near * (1.0 - turned), near * _LEAST), 0.0)
             near_out[range_in[s, 2] + j - range_in[s, 0]] = ti.cast(near, ti.f32)
 
 
