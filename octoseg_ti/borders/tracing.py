@@ -55,10 +55,10 @@ def find_borders(search: Search, lines: Lines | None = None) -> Borders:
         lines: The points in scan order, to find edges of which one face was scanned; None = these
             are not looked for.
     """
+    zones = find_zones(search)
     for turn in range(_ROUNDS):
         if turn:
             refit_sides(search)
-        zones = find_zones(search)
         fit = fit_balls(search, zones)
         chosen = claim_points(search, zones, fit)
     fillets = np.flatnonzero(chosen)
