@@ -16,7 +16,7 @@ from octoseg_ti.stages.leaves import Samples
 from octoseg_ti.stages.marking import nearest_marked
 from octoseg_ti.stages.profiles import BALL, NOWHERE
 from octoseg_ti.stages.sets import fit_sets, spread
-from octoseg_ti.types import NONE
+from octoseg_ti.types import NONE, SurfaceKind
 
 ON = 3.5
 """A point lies on a ball within so many noises."""
@@ -25,12 +25,13 @@ ON = 3.5
 # tried on; each of these is larger than the last by the ratio.
 _MANY, _SOME, _FEW = 3000, 600, 150
 _RATIO = 1.15
+_SKIP, _SURE = 4, 4.0
 _HOPE = 0.03  # share of the points that a radius has to explain beyond a sharp edge, to go on
 _NEWTON = 6
 _TURN = 0.5  # ... and its normal is that of the ball within this angle [rad]
 # A fillet gains at least this much over a sharp edge, in squares of the noise: in all, and for each
 # point on it.
-_GAIN, _EACH = 40.0, 0.25
+_GAIN, _EACH = 40.0, 0.1
 _ARC = 1.5  # a fillet is at least this wide [spacings]
 _SLACK = 1.05  # its radius may be above the limit by so much: that it is not known exactly
 _FEWEST = 8
@@ -42,6 +43,7 @@ _FRESH = 0.5  # ... and this share of its points is on no better one
 _WEAK = 2.0  # a point so many noises from the surface of its patch lies on that
 _STRIP_SHARE = 0.5  # a patch is the strip of a fillet when so much of it is claimed
 _REFIT = 300
+_SMOOTH = 0.09  # surfaces that meet at a smaller angle [rad] meet smoothly, if one is curved
 
 
 class Fit(NamedTuple):
@@ -79,33 +81,40 @@ def fit_balls(search: Search, zones: Zones) -> Fit:
     every = total / np.maximum(share, 1e-9)
     height = np.bincount(pair, np.sign(at.height[kept]), pairs)
     hollow = np.where(height < 0.0, -1.0, 1.0)
+    many, many_of = point, pair
     kept = thinned(pair, pairs, _SOME)
     point, pair = point[kept], pair[kept]
     kept = thinned(pair, pairs, _FEW)
-    total = np.bincount(pair[kept], minlength=pairs)
-    ends = np.cumsum(total)
     radii = np.concatenate([[0.0], search.radii(_RATIO)])
-    task = np.column_stack([zones.pairs, ends - total, ends])
+    task = tasks(zones.pairs, pair[kept])
     cost, _ = search.tried(task, radii, hollow, point[kept])
-    best = cost.argmin(axis=1)
-    gain = (cost[:, 0] - cost.min(axis=1)) * (search.coarse() / noise) ** 2
+    radius = np.maximum(radii[cost.argmin(axis=1)], 0.5 * search.spacing)
+    total = task[:, 3] - task[:, 2]
+    unit = (search.coarse() / noise) ** 2
+    gain = (cost[:, 0] - cost.min(axis=1)) * unit
     hope = gain > np.maximum(_HOPE * total, 1.0)
-    radius = np.maximum(radii[best], 0.5 * search.spacing)
-    total = np.bincount(pair, minlength=pairs)
-    ends = np.cumsum(total)
-    task = np.column_stack([zones.pairs, ends - total, ends])[hope]
+    # Where noise hides the fillet among few points, it may show among more.
+    task = tasks(zones.pairs, pair)
+    again = np.flatnonzero(~hope & ~smooth_pairs(search, zones.pairs, turn) & (total >= _FEWEST))
+    cost, _ = search.tried(task[again], radii[::_SKIP], hollow[again], point)
+    gain = (cost[:, 0] - cost.min(axis=1)) * unit
+    hope[again] = gain > _SURE
+    radius[again] = np.maximum(radii[::_SKIP][cost.argmin(axis=1)], 0.5 * search.spacing)
     now, none = np.zeros((pairs, 4)), np.zeros((pairs, 4))
     shape = np.column_stack([radius, hollow])[hope]
     cap = CAP * noise
-    none[hope] = search.sums(task, shape * [0.0, 1.0], point, cap)
     # From the tolerance that radii were tried with down to that of the noise: where this is small
     # no point lies within it of a ball whose radius is only about right.
     for wide in np.append(np.geomspace(search.coarse(), cap, _NEWTON - 2), cap):
-        now[hope] = search.sums(task, shape, point, wide)
+        if wide == cap:
+            task, point = tasks(zones.pairs, many_of), many
+        now[hope] = search.sums(task[hope], shape, point, wide)
         step = -now[hope, 1] / np.maximum(now[hope, 2], 1e-12)
         least = 0.2 * shape[:, 0]
         shape[:, 0] = np.clip(shape[:, 0] + np.clip(step, -least, least), 0.02, 2.0 * search.limit)
-    now[hope] = search.sums(task, shape, point, cap)
+    now[hope] = search.sums(task[hope], shape, point, cap)
+    none[hope] = search.sums(task[hope], shape * [0.0, 1.0], point, cap)
+    total = task[:, 3] - task[:, 2]
     radius[hope] = shape[:, 0]
     gain = (none[:, 0] - now[:, 0]) / noise**2
     rms = np.sqrt(now[:, 0] / np.maximum(total, 1))
@@ -125,6 +134,13 @@ def fit_balls(search: Search, zones: Zones) -> Fit:
         good=good,
         quality=np.clip(1.5 - rms / (2.0 * noise), 0.1, 1.0),
     )
+
+
+def tasks(pairs: np.ndarray, pair: np.ndarray) -> np.ndarray:
+    """Return both surfaces of every pair and the range of its entries, shape (P, 4)."""
+    total = np.bincount(pair, minlength=len(pairs))
+    ends = np.cumsum(total)
+    return np.column_stack([pairs, ends - total, ends])
 
 
 def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
@@ -218,3 +234,17 @@ def strips_of(search: Search, number: np.ndarray) -> np.ndarray:
     table = np.bincount(key, minlength=search.count * max(fillets, 1)).reshape(search.count, -1)
     most = table.sum(axis=1) >= np.maximum(_STRIP_SHARE * search.size, 1)
     return np.where(most, table.argmax(axis=1), NONE).astype(np.int32)
+
+
+def smooth_pairs(search: Search, pairs: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Say which pairs of surfaces meet without an angle, as far as their errors tell, (P,) bool."""
+    kind = search.table[:, 8].astype(np.int32)
+    curved = np.full(search.count, np.inf)
+    ball = (kind == int(SurfaceKind.CYLINDER)) | (kind == int(SurfaceKind.SPHERE))
+    ring = kind == int(SurfaceKind.TORUS)
+    curved[ball], curved[ring] = search.table[ball, 6], search.table[ring, 7]
+    # An error of place as large as the noise opens a tangent joint by this angle.
+    radius = np.maximum(curved[pairs].min(axis=1), 1e-9)
+    open_ = np.maximum(_SMOOTH, np.sqrt(4.0 * search.noise / radius))
+    flat = (kind[pairs] == int(SurfaceKind.PLANE)).all(axis=1)
+    return ~flat & (turn < open_)

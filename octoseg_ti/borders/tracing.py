@@ -16,17 +16,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octoseg_ti.borders.fillets import ON, Fit, claim_points, fit_balls, refit_sides, strips_of
+from octoseg_ti.borders.fillets import (
+    ON,
+    Fit,
+    claim_points,
+    fit_balls,
+    refit_sides,
+    smooth_pairs,
+    strips_of,
+)
 from octoseg_ti.borders.rims import mark_rims
 from octoseg_ti.borders.zones import CAP, EDGE, Search, Zones, find_zones, ranges
 from octoseg_ti.stages.marking import nearest_marked
 from octoseg_ti.stages.profiles import BALL
 from octoseg_ti.stages.rims import Lines
-from octoseg_ti.types import NONE, EdgeClass, SurfaceKind
+from octoseg_ti.types import NONE, EdgeClass
 
 # Rounds of claims; between them surfaces are fitted anew without what was claimed.
 _ROUNDS = 2
-_SMOOTH = 0.09  # surfaces that meet at a smaller angle [rad] meet smoothly, if one is curved
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -144,17 +151,3 @@ def mark_points(
     edge[point[order]] = code[pair[order]]
     edge[search.claim >= 0] = int(EdgeClass.FILLET)
     return edge
-
-
-def smooth_pairs(search: Search, pairs: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Say which pairs of surfaces meet without an angle, as far as their errors tell, (P,) bool."""
-    kind = search.table[:, 8].astype(np.int32)
-    curved = np.full(search.count, np.inf)
-    ball = (kind == int(SurfaceKind.CYLINDER)) | (kind == int(SurfaceKind.SPHERE))
-    ring = kind == int(SurfaceKind.TORUS)
-    curved[ball], curved[ring] = search.table[ball, 6], search.table[ring, 7]
-    # An error of place as large as the noise opens a tangent joint by this angle.
-    radius = np.maximum(curved[pairs].min(axis=1), 1e-9)
-    open_ = np.maximum(_SMOOTH, np.sqrt(4.0 * search.noise / radius))
-    flat = (kind[pairs] == int(SurfaceKind.PLANE)).all(axis=1)
-    return ~flat & (turn < open_)
