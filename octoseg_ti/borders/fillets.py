@@ -39,6 +39,8 @@ _SHARED = 2.0  # neighbours share some of their noise, and the sides are not kno
 # Its points are no farther from the ball than from the surfaces of their patches, times this, plus
 # so many noises.
 _WORSE, _EVEN = 1.2, 0.3
+# Beside the points of its sides, so large a share may be of patches that explain them better.
+_FOREIGN = 0.25
 _FRESH = 0.5  # ... and this share of its points is on no better one
 _WEAK = 2.0  # a point so many noises from the surface of its patch lies on that
 _STRIP_SHARE = 0.5  # a patch is the strip of a fillet when so much of it is claimed
@@ -159,14 +161,21 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
     better = ball <= _WORSE**2 * own + (_EVEN * search.noise) ** 2 * number
     side = (search.label[point][:, None] == zones.pairs[pair]).any(axis=1)
     kept = better[of] | side
-    others = np.bincount(pair, ~side, len(zones.pairs))
-    agree = 2.0 * np.bincount(pair, kept & ~side, len(zones.pairs)) >= others
+    pairs = len(zones.pairs)
+    spared, wrong = kept & ~side, ~kept
+    agree = np.bincount(pair, wrong, pairs) <= np.maximum(
+        np.bincount(pair, spared, pairs), _FOREIGN * np.bincount(pair, side, pairs)
+    )
     point, pair = point[kept], pair[kept]
-    ends = np.searchsorted(pair, np.arange(len(zones.pairs) + 1))
+    ends = np.searchsorted(pair, np.arange(pairs + 1))
     support = np.diff(ends)
+    # A ball that explains its points as well as surfaces do theirs goes before one that does not.
+    square = np.bincount(pair, at.off[on][kept] ** 2, pairs) / np.maximum(support, 1)
+    usual = np.mean(search.off[search.label >= 0] ** 2)
+    quality = np.clip(2.0 - square / max(usual, 1e-12), 0.1, 1.0)
     search.claim[:] = NONE
     chosen = np.zeros(len(zones.pairs), bool)
-    for p in np.argsort(-support * fit.quality, kind="stable"):
+    for p in np.argsort(-support * quality, kind="stable"):
         if support[p] < _FEWEST or not agree[p]:
             continue
         mine = point[ends[p] : ends[p + 1]]
