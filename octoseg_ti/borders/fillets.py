@@ -21,6 +21,9 @@ from octoseg_ti.types import NONE, SurfaceKind
 ON = 3.5
 """A point lies on a ball within so many noises."""
 
+SLACK = 1.05
+"""The radius of a fillet may be above the limit by so much: it is not known exactly."""
+
 # Points of the zone of an edge that are looked at, that the radius is fitted to, and that radii are
 # tried on; each of these is larger than the last by the ratio.
 _MANY, _SOME, _FEW = 3000, 600, 150
@@ -33,7 +36,6 @@ _TURN = 0.5  # ... and its normal is that of the ball within this angle [rad]
 # point on it.
 _GAIN, _EACH = 40.0, 0.1
 _ARC = 1.5  # a fillet is at least this wide [spacings]
-_SLACK = 1.05  # its radius may be above the limit by so much: that it is not known exactly
 _FEWEST = 8
 _SHARED = 2.0  # neighbours share some of their noise, and the sides are not known exactly
 # Its points are no farther from the ball than from the surfaces of their patches, times this, plus
@@ -124,7 +126,7 @@ def fit_balls(search: Search, zones: Zones) -> Fit:
         (gain * every >= _GAIN * np.maximum(total, 1))
         & (gain >= _EACH * now[:, 3])
         & (radius * turn >= _ARC * search.spacing)
-        & (radius <= _SLACK * search.limit)
+        & (radius <= SLACK * search.limit)
         & (now[:, 3] >= _FEWEST)
     )
     return Fit(

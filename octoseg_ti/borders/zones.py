@@ -50,6 +50,8 @@ class Zones(NamedTuple):
     """Pair and label of points that may lie on the edge, as one number, ascending."""
     width: int
     """Labels are below this."""
+    contact: np.ndarray
+    """Leaves where both patches of every pair are near, shape (P,)."""
 
     def allows(self, pair: np.ndarray, label: np.ndarray) -> np.ndarray:
         """Say which points may lie on an edge: those of its sides, its strips, of no patch."""
@@ -276,9 +278,10 @@ def find_zones(search: Search) -> Zones:
     size = search.leaves.size
     small = size <= max(2.0 * size.min(), search.absorbed())
     real = search.analytic[pairs].all(axis=1)
+    met = pairs[real, 0].astype(np.int64) * width + pairs[real, 1]
     key = np.concatenate(
         [
-            (pairs[real, 0].astype(np.int64) * width + pairs[real, 1]) * cells + leaf[real],
+            met * cells + leaf[real],
             (triple[between, 1] * width + triple[between, 2]) * cells + along,
         ]
     )
@@ -295,7 +298,8 @@ def find_zones(search: Search) -> Zones:
              between * width + triple[:, 0]]
         )
     )  # fmt: skip
-    return Zones(pairs, which, key % cells, fine, labels, width)
+    met = np.bincount(np.searchsorted(code, met), minlength=len(code))
+    return Zones(pairs, which, key % cells, fine, labels, width, met)
 
 
 def leaves_between(search: Search, triple: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
