@@ -176,15 +176,19 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
     usual = np.mean(search.off[search.label >= 0] ** 2)
     quality = np.clip(2.0 - square / max(usual, 1e-12), 0.1, 1.0)
     search.claim[:] = NONE
-    chosen = np.zeros(len(zones.pairs), bool)
+    chosen, taken = np.zeros(pairs, bool), np.zeros(search.count, np.int64)
     for p in np.argsort(-support * quality, kind="stable"):
         if support[p] < _FEWEST or not agree[p]:
+            continue
+        # A strip of other fillets is no side of one.
+        if (taken[zones.pairs[p]] >= _STRIP_SHARE * search.size[zones.pairs[p]]).any():
             continue
         mine = point[ends[p] : ends[p + 1]]
         fresh = mine[search.claim[mine] < 0]
         if len(fresh) < max(_FRESH * len(mine), _FEWEST):
             continue
         search.claim[fresh] = p
+        taken += np.bincount(search.label[fresh] + 1, minlength=search.count + 1)[1:]
         chosen[p] = True
     drop_weak_claims(search, zones, fit)
     return chosen
