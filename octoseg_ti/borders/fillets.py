@@ -65,13 +65,31 @@ class Fit(NamedTuple):
     """Points of the zone near the edge."""
     good: np.ndarray
     """Whether the ball may be a fillet."""
-    quality: np.ndarray
-    """Weight of its support, 0.1..1."""
 
 
-def fit_balls(search: Search, zones: Zones) -> Fit:
-    """Fit a ball to the points around the edge of every pair."""
-    pairs, noise = len(zones.pairs), search.noise
+class Around(NamedTuple):
+    """The points around the edges of all pairs, in the order of these."""
+
+    point: np.ndarray
+    """Some of the points, evenly, shape (E,)."""
+    pair: np.ndarray
+    """The pair of each."""
+    every: np.ndarray
+    """About how many points there are, shape (P,)."""
+    hollow: np.ndarray
+    """1 where the edge is concave, -1 where it is convex."""
+    turn: np.ndarray
+    """Mean angle by which the surface turns over the edge [rad]."""
+
+    def thinned(self, most: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return at most about so many points for every pair, and the pair of each."""
+        kept = thinned(self.pair, len(self.every), most)
+        return self.point[kept], self.pair[kept]
+
+
+def look_around(search: Search, zones: Zones) -> Around:
+    """Return the points around the edge of every pair."""
+    pairs = len(zones.pairs)
     point, pair = points_of(search, zones, np.ones(pairs, bool))
     whole = np.bincount(pair, minlength=pairs)
     kept = thinned(pair, pairs, _MANY)
@@ -81,62 +99,79 @@ def fit_balls(search: Search, zones: Zones) -> Fit:
     kept = (at.region != NOWHERE) & (at.along <= search.reach(at.turn))
     point, pair = point[kept], pair[kept]
     total = np.bincount(pair, minlength=pairs)
-    turn = np.bincount(pair, at.turn[kept], pairs) / np.maximum(total, 1)
-    every = total / np.maximum(share, 1e-9)
     height = np.bincount(pair, np.sign(at.height[kept]), pairs)
-    hollow = np.where(height < 0.0, -1.0, 1.0)
-    many, many_of = point, pair
-    kept = thinned(pair, pairs, _SOME)
-    point, pair = point[kept], pair[kept]
-    kept = thinned(pair, pairs, _FEW)
+    return Around(
+        point=point,
+        pair=pair,
+        every=total / np.maximum(share, 1e-9),
+        hollow=np.where(height < 0.0, -1.0, 1.0),
+        turn=np.bincount(pair, at.turn[kept], pairs) / np.maximum(total, 1),
+    )
+
+
+def guess_radii(search: Search, zones: Zones, around: Around) -> tuple[np.ndarray, np.ndarray]:
+    """Return about which radius every edge has, and whether it may have one, (P,) f64 and bool."""
+    point, pair = around.thinned(_FEW)
+    least = 0.5 * search.spacing
     radii = np.concatenate([[0.0], search.radii(_RATIO)])
-    task = tasks(zones.pairs, pair[kept])
-    cost, _ = search.tried(task, radii, hollow, point[kept])
-    radius = np.maximum(radii[cost.argmin(axis=1)], 0.5 * search.spacing)
-    total = task[:, 3] - task[:, 2]
-    unit = (search.coarse() / noise) ** 2
-    gain = (cost[:, 0] - cost.min(axis=1)) * unit
-    hope = gain > np.maximum(_HOPE * total, 1.0)
-    # Where noise hides the fillet among few points, it may show among more.
     task = tasks(zones.pairs, pair)
-    again = np.flatnonzero(~hope & ~smooth_pairs(search, zones.pairs, turn) & (total >= _FEWEST))
-    cost, _ = search.tried(task[again], radii[::_SKIP], hollow[again], point)
-    gain = (cost[:, 0] - cost.min(axis=1)) * unit
-    hope[again] = gain > _SURE
-    radius[again] = np.maximum(radii[::_SKIP][cost.argmin(axis=1)], 0.5 * search.spacing)
-    now, none = np.zeros((pairs, 4)), np.zeros((pairs, 4))
-    shape = np.column_stack([radius, hollow])[hope]
+    cost, _ = search.tried(task, radii, around.hollow, point)
+    radius = np.maximum(radii[cost.argmin(axis=1)], least)
+    unit = (search.coarse() / search.noise) ** 2
+    total = task[:, 3] - task[:, 2]
+    hope = (cost[:, 0] - cost.min(axis=1)) * unit > np.maximum(_HOPE * total, 1.0)
+    # What the noise of few points hides may show among more.
+    unsure = ~hope & (total >= _FEWEST) & ~smooth_pairs(search, zones.pairs, around.turn)
+    again = np.flatnonzero(unsure)
+    point, pair = around.thinned(_SOME)
+    cost, _ = search.tried(
+        tasks(zones.pairs, pair)[again], radii[::_SKIP], around.hollow[again], point
+    )
+    hope[again] = (cost[:, 0] - cost.min(axis=1)) * unit > _SURE
+    radius[again] = np.maximum(radii[::_SKIP][cost.argmin(axis=1)], least)
+    return radius, hope
+
+
+def fit_balls(search: Search, zones: Zones, around: Around, *, last: bool) -> Fit:
+    """Fit a ball to the points around the edge of every pair; to more of them at ``last``."""
+    pairs, noise = len(zones.pairs), search.noise
+    radius, hope = guess_radii(search, zones, around)
+    point, pair = around.thinned(_SOME)
+    task = tasks(zones.pairs, pair)
+    shape = np.column_stack([radius, around.hollow])[hope]
     cap = CAP * noise
     # From the tolerance that radii were tried with down to that of the noise: where this is small
     # no point lies within it of a ball whose radius is only about right.
-    for wide in np.append(np.geomspace(search.coarse(), cap, _NEWTON - 2), cap):
-        if wide == cap:
-            task, point = tasks(zones.pairs, many_of), many
-        now[hope] = search.sums(task[hope], shape, point, wide)
-        step = -now[hope, 1] / np.maximum(now[hope, 2], 1e-12)
+    tolerances = np.append(np.geomspace(search.coarse(), cap, _NEWTON - 2), cap)
+    for turn, wide in enumerate(tolerances):
+        if last and turn == len(tolerances) - 1:
+            point, pair = around.point, around.pair
+            task = tasks(zones.pairs, pair)
+        now = search.sums(task[hope], shape, point, wide)
+        step = -now[:, 1] / np.maximum(now[:, 2], 1e-12)
         least = 0.2 * shape[:, 0]
         shape[:, 0] = np.clip(shape[:, 0] + np.clip(step, -least, least), 0.02, 2.0 * search.limit)
+    now, none = np.zeros((pairs, 4)), np.zeros((pairs, 4))
     now[hope] = search.sums(task[hope], shape, point, cap)
     none[hope] = search.sums(task[hope], shape * [0.0, 1.0], point, cap)
-    total = task[:, 3] - task[:, 2]
     radius[hope] = shape[:, 0]
+    total = np.maximum(task[:, 3] - task[:, 2], 1)
     gain = (none[:, 0] - now[:, 0]) / noise**2
-    rms = np.sqrt(now[:, 0] / np.maximum(total, 1))
+    rms = np.sqrt(now[:, 0] / total)
     good = hope & (
-        (gain * every >= _GAIN * np.maximum(total, 1))
+        (gain * around.every >= _GAIN * total)
         & (gain >= _EACH * now[:, 3])
-        & (radius * turn >= _ARC * search.spacing)
+        & (radius * around.turn >= _ARC * search.spacing)
         & (radius <= SLACK * search.limit)
         & (now[:, 3] >= _FEWEST)
     )
     return Fit(
-        radius=radius * hollow,
+        radius=radius * around.hollow,
         deviation=_SHARED * np.maximum(rms, 0.3 * noise) / np.sqrt(np.maximum(now[:, 2], 1e-12)),
-        hollow=hollow,
-        turn=turn,
-        points=total,
+        hollow=around.hollow,
+        turn=around.turn,
+        points=task[:, 3] - task[:, 2],
         good=good,
-        quality=np.clip(1.5 - rms / (2.0 * noise), 0.1, 1.0),
     )
 
 
