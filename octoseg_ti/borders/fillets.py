@@ -132,10 +132,17 @@ def guess_radii(search: Search, zones: Zones, around: Around) -> tuple[np.ndarra
     return radius, hope
 
 
-def fit_balls(search: Search, zones: Zones, around: Around, *, last: bool) -> Fit:
+def fit_balls(
+    search: Search,
+    zones: Zones,
+    around: Around,
+    guess: tuple[np.ndarray, np.ndarray],
+    *,
+    last: bool,
+) -> Fit:
     """Fit a ball to the points around the edge of every pair; to more of them at ``last``."""
     pairs, noise = len(zones.pairs), search.noise
-    radius, hope = guess_radii(search, zones, around)
+    radius, hope = guess[0].copy(), guess[1]
     point, pair = around.thinned(_SOME)
     task = tasks(zones.pairs, pair)
     shape = np.column_stack([radius, around.hollow])[hope]

@@ -22,6 +22,7 @@ from octoseg_ti.borders.fillets import (
     Fit,
     claim_points,
     fit_balls,
+    guess_radii,
     look_around,
     refit_sides,
     smooth_pairs,
@@ -66,10 +67,11 @@ def find_borders(search: Search, lines: Lines | None = None) -> Borders:
     """
     zones = find_zones(search)
     around = look_around(search, zones)
+    guess = guess_radii(search, zones, around)
     for turn in range(_ROUNDS):
         if turn:
             refit_sides(search)
-        fit = fit_balls(search, zones, around, last=turn == _ROUNDS - 1)
+        fit = fit_balls(search, zones, around, guess, last=turn == _ROUNDS - 1)
         chosen = claim_points(search, zones, fit)
     fillets = np.flatnonzero(chosen)
     number = np.full(len(zones.pairs) + 1, NONE, np.int32)

@@ -25,10 +25,10 @@ EDGE = 2.0
 """Edge points are this near an edge [spacings]."""
 
 # Samples of a patch that tell its side, and of a strip that tell what it lies between.
-_SIDE, _STRIP = 200, 150
+_SIDE, _STRIP = 200, 100
 # So many of its samples lie on a ball between two surfaces (or this share of all its points, where
 # these are few), and of those between the lines of contact this share.
-_LOCAL, _BETWEEN, _MOSTLY = 12, 0.3, 0.5
+_LOCAL, _BETWEEN, _MOSTLY = 8, 0.3, 0.5
 # Radii that are tried: from the least [spacings] up to so many limits.
 _LEAST, _MOST = 1.0, 1.35
 _RATIO = 1.3  # each larger by this ratio: a strip is only to be recognised
