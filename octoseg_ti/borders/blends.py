@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from octoseg_ti.borders.fillets import SLACK, smooth_pairs
-from octoseg_ti.borders.zones import Search, Zones
-from octoseg_ti.types import SurfaceKind
+from octoseg_ti.borders.fillets import SLACK, WEAK, smooth_pairs, without_support
+from octoseg_ti.borders.zones import EDGE, Search, Zones, points_of
+from octoseg_ti.device.surfaces import evaluate_surfaces
+from octoseg_ti.stages.marking import nearest_marked
+from octoseg_ti.types import NONE, EdgeClass, SurfaceKind
 
 # A blend joins at least so many others smoothly, along this share of its border.
 _JOINED, _SHARE = 2, 0.5
@@ -56,3 +58,45 @@ def find_blends(search: Search, zones: Zones, turn: np.ndarray) -> np.ndarray:
         small & (joined >= _JOINED) & (along >= _SHARE * border) & (length >= _OPEN)
     )
     return blends
+
+
+def mark_blends(
+    search: Search, zones: Zones, blend: np.ndarray, smooth: np.ndarray, edge: np.ndarray
+) -> None:
+    """Mark the points of blends and those beside them as fillets, in place.
+
+    Args:
+        search: What is known.
+        zones: The pairs of patches.
+        blend: Which patches are blends, shape (K,), bool.
+        smooth: Which pairs join smoothly, shape (P,), bool.
+        edge: `EdgeClass` of every point so far, shape (n,), u8.
+    """
+    mark = np.full(len(search.label), NONE, np.int32)
+    mine = np.flatnonzero(search.label >= 0)
+    mine = mine[blend[search.label[mine]]]
+    mark[mine] = search.label[mine]
+    # A surface that touches another lies on it for a while beyond the end of its patch.
+    radius, weak = ball_radii(search), np.zeros(len(search.label), bool)
+    kind = search.table[:, 8].astype(np.int32)
+    for patch, beside in np.concatenate([zones.pairs[smooth], zones.pairs[smooth, ::-1]]):
+        if blend[patch]:
+            of = search.members[patch]
+            near = np.full(len(of), beside)
+            far, _ = evaluate_surfaces(search.points[of], near, kind, search.table[:, :8])
+            weak[of] |= np.abs(far) <= WEAK * search.noise
+    doubtful = mine[weak[mine]]
+    mark[without_support(search, mark, doubtful, radius[search.label[doubtful]])] = NONE
+    edge[mark >= 0] = int(EdgeClass.FILLET)
+    # Beside them: points of the patches that they join.
+    for column in (0, 1):
+        asked = smooth & blend[zones.pairs[:, column]]
+        point, pair = points_of(search, zones, asked)
+        patch = zones.pairs[pair, column]
+        kept = (search.label[point] != patch) & (edge[point] != int(EdgeClass.FILLET))
+        point, patch = point[kept], patch[kept]
+        far = nearest_marked(
+            search.device[0], mark, search.leaves, search.box, point, search.leaf_of(point), patch,
+            np.full(len(point), EDGE * search.spacing),
+        )  # fmt: skip
+        edge[point[np.isfinite(far)]] = int(EdgeClass.FILLET)

@@ -21,6 +21,8 @@ from octoseg_ti.types import NONE, SurfaceKind
 ON = 3.5
 """A point lies on a ball within so many noises."""
 
+WEAK = 2.0
+"""A point so many noises from a surface may lie on that."""
 SLACK = 1.05
 """The radius of a fillet may be above the limit by so much: it is not known exactly."""
 
@@ -44,7 +46,6 @@ _WORSE, _EVEN = 1.2, 0.3
 # Beside the points of its sides, so large a share may be of patches that explain them better.
 _FOREIGN = 0.25
 _FRESH = 0.5  # ... and this share of its points is on no better one
-_WEAK = 2.0  # a point so many noises from the surface of its patch lies on that
 _STRIP_SHARE = 0.5  # a patch is the strip of a fillet when so much of it is claimed
 _REFIT = 300
 _SMOOTH = 0.09  # surfaces that meet at a smaller angle [rad] meet smoothly, if one is curved
@@ -245,14 +246,30 @@ def drop_weak_claims(search: Search, zones: Zones, fit: Fit) -> None:
     mine = np.flatnonzero(search.claim >= 0)
     pair = search.claim[mine]
     side = (search.label[mine][:, None] == zones.pairs[pair]).any(axis=1)
-    weak = side & (search.off[mine] <= _WEAK * search.noise)
-    mark = search.claim.copy()
-    mark[mine[weak]] = NONE
-    mine, pair = mine[weak], pair[weak]
-    leaf = search.leaf_of(mine)
-    reach = np.sqrt(2.0 * ON * search.noise * np.abs(fit.radius[pair])) + search.spacing
-    far = nearest_marked(search.device[0], mark, search.leaves, search.box, mine, leaf, pair, reach)
-    search.claim[mine[~np.isfinite(far)]] = NONE
+    weak = side & (search.off[mine] <= WEAK * search.noise)
+    radius = np.abs(fit.radius[pair[weak]])
+    search.claim[without_support(search, search.claim, mine[weak], radius)] = NONE
+
+
+def without_support(
+    search: Search, mark: np.ndarray, weak: np.ndarray, radius: np.ndarray
+) -> np.ndarray:
+    """Return which weak points have no other one with the same mark near them.
+
+    Args:
+        search: What is known.
+        mark: Mark of every point, shape (n,), i32.
+        weak: Points that may as well lie on the surface beside, shape (E,).
+        radius: Radius of the fillet that each may lie on [mm], shape (E,).
+    """
+    strong = mark.copy()
+    strong[weak] = NONE
+    leaf = search.leaf_of(weak)
+    reach = np.sqrt(2.0 * ON * search.noise * radius) + search.spacing
+    far = nearest_marked(
+        search.device[0], strong, search.leaves, search.box, weak, leaf, mark[weak], reach
+    )
+    return weak[~np.isfinite(far)]
 
 
 def refit_sides(search: Search) -> None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octoseg_ti.borders.blends import find_blends
+from octoseg_ti.borders.blends import find_blends, mark_blends
 from octoseg_ti.borders.fillets import (
     ON,
     Fit,
@@ -97,9 +97,7 @@ def mark_points(
     leaves, reach = search.leaves, EDGE * search.spacing
     radius = np.where(chosen, fit.radius, 1e-12 * fit.hollow)
     smooth = ~chosen & (smooth_pairs(search, zones.pairs, fit.turn) | (fit.points < 5))
-    blend = find_blends(search, zones, fit.turn) & (strip < 0)
-    round_ = smooth & blend[zones.pairs].any(axis=1)
-    idle = ~chosen & ~round_ & (strip[zones.pairs] >= 0).any(axis=1) & smooth
+    idle = ~chosen & (strip[zones.pairs] >= 0).any(axis=1) & smooth
     # The leaves of the zones, and those that touch them.
     more = ~smooth[zones.pair]
     near_pair, near_leaf = zones.pair[more].astype(np.int64), zones.leaf[more]
@@ -151,10 +149,12 @@ def mark_points(
         found[k] = np.isfinite(distance)
     point, pair, along = point[found], pair[found], along[found]
     code = np.full(len(zones.pairs), int(EdgeClass.SHARP), np.uint8)
-    code[smooth], code[chosen | round_] = int(EdgeClass.SMOOTH), int(EdgeClass.FILLET)
+    code[smooth], code[chosen] = int(EdgeClass.SMOOTH), int(EdgeClass.FILLET)
     # A smooth joint has no line; what is nearer to another edge belongs to that.
     order = np.argsort(-np.where(smooth[pair], reach, along), kind="stable")
     edge = np.zeros(len(search.points), np.uint8)
     edge[point[order]] = code[pair[order]]
-    edge[(search.claim >= 0) | ((search.label >= 0) & blend[search.label])] = int(EdgeClass.FILLET)
+    blend = find_blends(search, zones, fit.turn) & (strip < 0)
+    mark_blends(search, zones, blend, smooth, edge)
+    edge[search.claim >= 0] = int(EdgeClass.FILLET)
     return edge
