@@ -43,6 +43,9 @@ _SHARED = 2.0  # neighbours share some of their noise, and the sides are not kno
 # Its points are no farther from the ball than from the surfaces of their patches, times this, plus
 # so many noises.
 _WORSE, _EVEN = 1.2, 0.3
+# Where a ball explains all points they are no farther from it than points are from the surfaces of
+# their patches, times this.
+_ALIKE = 1.4
 # Beside the points of its sides, so large a share may be of patches that explain them better.
 _FOREIGN = 0.25
 _FRESH = 0.5  # ... and this share of its points is on no better one
@@ -66,6 +69,8 @@ class Fit(NamedTuple):
     """Points of the zone near the edge."""
     good: np.ndarray
     """Whether the ball may be a fillet."""
+    large: np.ndarray
+    """Whether there is a ball that is too large for a fillet, which explains all points."""
 
 
 class Around(NamedTuple):
@@ -166,20 +171,21 @@ def fit_balls(
     total = np.maximum(task[:, 3] - task[:, 2], 1)
     gain = (none[:, 0] - now[:, 0]) / noise**2
     rms = np.sqrt(now[:, 0] / total)
-    good = hope & (
+    rounded = hope & (
         (gain * around.every >= _GAIN * total)
         & (gain >= _EACH * now[:, 3])
         & (radius * around.turn >= _ARC * search.spacing)
-        & (radius <= SLACK * search.limit)
         & (now[:, 3] >= _FEWEST)
     )
+    small = radius <= SLACK * search.limit
     return Fit(
         radius=radius * around.hollow,
         deviation=_SHARED * np.maximum(rms, 0.3 * noise) / np.sqrt(np.maximum(now[:, 2], 1e-12)),
         hollow=around.hollow,
         turn=around.turn,
         points=task[:, 3] - task[:, 2],
-        good=good,
+        good=rounded & small,
+        large=rounded & ~small & (rms <= _ALIKE * search.usual()),
     )
 
 
@@ -216,8 +222,7 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
     support = np.diff(ends)
     # A ball that explains its points as well as surfaces do theirs goes before one that does not.
     square = np.bincount(pair, at.off[on][kept] ** 2, pairs) / np.maximum(support, 1)
-    usual = np.mean(search.off[search.label >= 0] ** 2)
-    quality = np.clip(2.0 - square / max(usual, 1e-12), 0.1, 1.0)
+    quality = np.clip(2.0 - square / max(search.usual() ** 2, 1e-12), 0.1, 1.0)
     search.claim[:] = NONE
     chosen, taken = np.zeros(pairs, bool), np.zeros(search.count, np.int64)
     for p in np.argsort(-support * quality, kind="stable"):

@@ -96,7 +96,8 @@ def mark_points(
     """Return the `EdgeClass` of every point: that of the nearest edge within two spacings."""
     leaves, reach = search.leaves, EDGE * search.spacing
     radius = np.where(chosen, fit.radius, 1e-12 * fit.hollow)
-    smooth = ~chosen & (smooth_pairs(search, zones.pairs, fit.turn) | (fit.points < 5))
+    smooth = smooth_pairs(search, zones.pairs, fit.turn) | fit.large | (fit.points < 5)
+    smooth &= ~chosen
     idle = ~chosen & (strip[zones.pairs] >= 0).any(axis=1) & smooth
     # The leaves of the zones, and those that touch them.
     more = ~smooth[zones.pair]

@@ -170,6 +170,11 @@ class Search:
         """Return how wide a piece of a fillet may pass as a part of the surface beside it [mm]."""
         return float(np.sqrt(2.0 * CAP * self.noise * self.limit)) + 1.5 * self.spacing
 
+    def usual(self) -> float:
+        """Return how far points are from the surfaces of their patches [mm]."""
+        off = self.off[self.label >= 0]
+        return float(np.sqrt(np.mean(off**2))) if len(off) else self.noise
+
     def radii(self, ratio: float) -> np.ndarray:
         """Return the radii that are tried, each larger than the last by this ratio."""
         least = _LEAST * self.spacing
