@@ -30,13 +30,17 @@ SLACK = 1.05
 # tried on; each of these is larger than the last by the ratio.
 _MANY, _SOME, _FEW = 3000, 600, 150
 _RATIO = 1.15
+# Where none explains enough, every fourth radius is tried again on more points; one that
+# gains so many squares of the noise is fitted.
 _SKIP, _SURE = 4, 4.0
 _HOPE = 0.03  # share of the points that a radius has to explain beyond a sharp edge, to go on
 _NEWTON = 6
 _TURN = 0.5  # ... and its normal is that of the ball within this angle [rad]
 # A fillet gains at least this much over a sharp edge, in squares of the noise: in all, and for each
-# point on it.
-_GAIN, _EACH = 40.0, 0.1
+# point on it: more than errors of the sides do, but no more than this share of what a ball of its
+# radius gains where the edge is shallow.
+_GAIN, _EACH, _EXPECTED = 40.0, (0.1, 0.25), 0.5
+_STEEP = 2.5  # turns beyond this [rad] count as this one
 _ARC = 1.5  # a fillet is at least this wide [spacings]
 _FEWEST = 8
 _SHARED = 2.0  # neighbours share some of their noise, and the sides are not known exactly
@@ -48,6 +52,7 @@ _WORSE, _EVEN = 1.2, 0.3
 _ALIKE = 1.4
 # Beside the points of its sides, so large a share may be of patches that explain them better.
 _FOREIGN = 0.25
+_FITS = 0.5  # ... and so much of the weight of its support is left, if it lies on another fillet
 _FRESH = 0.5  # ... and this share of its points is on no better one
 _STRIP_SHARE = 0.5  # a patch is the strip of a fillet when so much of it is claimed
 _REFIT = 300
@@ -170,10 +175,13 @@ def fit_balls(
     radius[hope] = shape[:, 0]
     total = np.maximum(task[:, 3] - task[:, 2], 1)
     gain = (none[:, 0] - now[:, 0]) / noise**2
+    # The mean square of the distances from a ball to the sharp edge within it.
+    wide = radius * (1.0 / np.cos(np.minimum(around.turn, _STEEP) / 2.0) - 1.0)
+    each = np.clip(_EXPECTED * wide**2 / (5.0 * noise**2), *_EACH)
     rms = np.sqrt(now[:, 0] / total)
     rounded = hope & (
         (gain * around.every >= _GAIN * total)
-        & (gain >= _EACH * now[:, 3])
+        & (gain >= each * now[:, 3])
         & (radius * around.turn >= _ARC * search.spacing)
         & (now[:, 3] >= _FEWEST)
     )
@@ -228,8 +236,9 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
     for p in np.argsort(-support * quality, kind="stable"):
         if support[p] < _FEWEST or not agree[p]:
             continue
-        # A strip of other fillets is no side of one.
-        if (taken[zones.pairs[p]] >= _STRIP_SHARE * search.size[zones.pairs[p]]).any():
+        # The strip of another fillet is a side only of a ball that fits as well as surfaces do.
+        strip = taken[zones.pairs[p]] >= _STRIP_SHARE * search.size[zones.pairs[p]]
+        if strip.any() and quality[p] < _FITS:
             continue
         mine = point[ends[p] : ends[p + 1]]
         fresh = mine[search.claim[mine] < 0]
@@ -251,7 +260,9 @@ def drop_weak_claims(search: Search, zones: Zones, fit: Fit) -> None:
     mine = np.flatnonzero(search.claim >= 0)
     pair = search.claim[mine]
     side = (search.label[mine][:, None] == zones.pairs[pair]).any(axis=1)
-    weak = side & (search.off[mine] <= WEAK * search.noise)
+    # Where no point of the ball is far from the sides that tells nothing.
+    deep = np.abs(fit.radius) * (1.0 - np.cos(fit.turn / 2.0)) >= (WEAK + 1.0) * search.noise
+    weak = side & deep[pair] & (search.off[mine] <= WEAK * search.noise)
     radius = np.abs(fit.radius[pair[weak]])
     search.claim[without_support(search, search.claim, mine[weak], radius)] = NONE
 
