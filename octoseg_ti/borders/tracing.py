@@ -6,8 +6,9 @@ only unknown. Balls that explain points which neither surface explains are fille
 supported first: each claims the points on it, and what is left has to support the next.
 
 A fillet has a radius of up to `EdgeParams.fillet_radius`, turns over at least two point spacings,
-and touches the surfaces on both of its sides. A round joint that is larger is a patch like any
-other, and so are cylinders that touch nothing along their sides: bosses, holes.
+and touches the surfaces on both of its sides. Where fillets meet, blends between them belong to no
+pair (`borders.blends`). A round joint that is larger is a patch like any other, and so are
+cylinders that touch nothing along their sides: bosses, holes.
 """
 
 from __future__ import annotations

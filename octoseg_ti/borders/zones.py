@@ -317,6 +317,7 @@ def leaves_between(search: Search, triple: np.ndarray) -> tuple[np.ndarray, np.n
     leaf, owner = cell[ranges(first[triple[:, 0]], each)], np.repeat(np.arange(len(triple)), each)
     low, high = search.box[:, :3], search.box[:, 3:]
     wide = 0.5 * np.linalg.norm(high - low, axis=1)
+    # How far fillets reach at most: the nearer ones are picked where points are placed.
     near = search.near_edge(
         triple[:, 1:], np.zeros(len(triple)), 0.5 * (low + high), leaf, owner,
         search.reach(np.full(1, np.pi)) + wide[leaf],
