@@ -16,33 +16,46 @@ from octoseg_ti.stages.leaves import Samples
 from octoseg_ti.stages.marking import nearest_marked
 from octoseg_ti.stages.profiles import BALL, NOWHERE
 from octoseg_ti.stages.sets import fit_sets, spread
-from octoseg_ti.types import NONE
+from octoseg_ti.types import NONE, SurfaceKind
 
 ON = 3.5
 """A point lies on a ball within so many noises."""
 WEAK = 2.0
-"""A point so many noises from the surface of its patch lies on that."""
+"""A point so many noises from a surface may lie on that."""
+SLACK = 1.05
+"""The radius of a fillet may be above the limit by so much: it is not known exactly."""
 
 # Points of the zone of an edge that are looked at, that the radius is fitted to, and that radii are
 # tried on; each of these is larger than the last by the ratio.
 _MANY, _SOME, _FEW = 3000, 600, 150
 _RATIO = 1.15
+# Where none explains enough, every fourth radius is tried again on more points; one that
+# gains so many squares of the noise is fitted.
+_SKIP, _SURE = 4, 4.0
 _HOPE = 0.03  # share of the points that a radius has to explain beyond a sharp edge, to go on
 _NEWTON = 6
 _TURN = 0.5  # ... and its normal is that of the ball within this angle [rad]
 # A fillet gains at least this much over a sharp edge, in squares of the noise: in all, and for each
-# point on it.
-_GAIN, _EACH = 40.0, 0.25
+# point on it: more than errors of the sides do, but no more than this share of what a ball of its
+# radius gains where the edge is shallow.
+_GAIN, _EACH, _EXPECTED = 40.0, (0.1, 0.25), 0.5
+_STEEP = 2.5  # turns beyond this [rad] count as this one
 _ARC = 1.5  # a fillet is at least this wide [spacings]
-_SLACK = 1.05  # its radius may be above the limit by so much: that it is not known exactly
 _FEWEST = 8
 _SHARED = 2.0  # neighbours share some of their noise, and the sides are not known exactly
 # Its points are no farther from the ball than from the surfaces of their patches, times this, plus
 # so many noises.
 _WORSE, _EVEN = 1.2, 0.3
+# Where a ball explains all points they are no farther from it than points are from the surfaces of
+# their patches, times this.
+_ALIKE = 1.4
+# Beside the points of its sides, so large a share may be of patches that explain them better.
+_FOREIGN = 0.25
+_FITS = 0.5  # ... and so much of the weight of its support is left, if it lies on another fillet
 _FRESH = 0.5  # ... and this share of its points is on no better one
 _STRIP_SHARE = 0.5  # a patch is the strip of a fillet when so much of it is claimed
 _REFIT = 300
+_SMOOTH = 0.09  # surfaces that meet at a smaller angle [rad] meet smoothly, if one is curved
 
 
 class Fit(NamedTuple):
@@ -60,13 +73,33 @@ class Fit(NamedTuple):
     """Points of the zone near the edge."""
     good: np.ndarray
     """Whether the ball may be a fillet."""
-    quality: np.ndarray
-    """Weight of its support, 0.1..1."""
+    large: np.ndarray
+    """Whether there is a ball that is too large for a fillet, which explains all points."""
 
 
-def fit_balls(search: Search, zones: Zones) -> Fit:
-    """Fit a ball to the points around the edge of every pair."""
-    pairs, noise = len(zones.pairs), search.noise
+class Around(NamedTuple):
+    """The points around the edges of all pairs, in the order of these."""
+
+    point: np.ndarray
+    """Some of the points, evenly, shape (E,)."""
+    pair: np.ndarray
+    """The pair of each."""
+    every: np.ndarray
+    """About how many points there are, shape (P,)."""
+    hollow: np.ndarray
+    """1 where the edge is concave, -1 where it is convex."""
+    turn: np.ndarray
+    """Mean angle by which the surface turns over the edge [rad]."""
+
+    def thinned(self, most: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return at most about so many points for every pair, and the pair of each."""
+        kept = thinned(self.pair, len(self.every), most)
+        return self.point[kept], self.pair[kept]
+
+
+def look_around(search: Search, zones: Zones) -> Around:
+    """Return the points around the edge of every pair."""
+    pairs = len(zones.pairs)
     point, pair = points_of(search, zones, np.ones(pairs, bool))
     whole = np.bincount(pair, minlength=pairs)
     kept = thinned(pair, pairs, _MANY)
@@ -76,56 +109,98 @@ def fit_balls(search: Search, zones: Zones) -> Fit:
     kept = (at.region != NOWHERE) & (at.along <= search.reach(at.turn))
     point, pair = point[kept], pair[kept]
     total = np.bincount(pair, minlength=pairs)
-    turn = np.bincount(pair, at.turn[kept], pairs) / np.maximum(total, 1)
-    every = total / np.maximum(share, 1e-9)
     height = np.bincount(pair, np.sign(at.height[kept]), pairs)
-    hollow = np.where(height < 0.0, -1.0, 1.0)
-    kept = thinned(pair, pairs, _SOME)
-    point, pair = point[kept], pair[kept]
-    kept = thinned(pair, pairs, _FEW)
-    total = np.bincount(pair[kept], minlength=pairs)
-    ends = np.cumsum(total)
+    return Around(
+        point=point,
+        pair=pair,
+        every=total / np.maximum(share, 1e-9),
+        hollow=np.where(height < 0.0, -1.0, 1.0),
+        turn=np.bincount(pair, at.turn[kept], pairs) / np.maximum(total, 1),
+    )
+
+
+def guess_radii(search: Search, zones: Zones, around: Around) -> tuple[np.ndarray, np.ndarray]:
+    """Return about which radius every edge has, and whether it may have one, (P,) f64 and bool."""
+    point, pair = around.thinned(_FEW)
+    least = 0.5 * search.spacing
     radii = np.concatenate([[0.0], search.radii(_RATIO)])
-    task = np.column_stack([zones.pairs, ends - total, ends])
-    cost, _ = search.tried(task, radii, hollow, point[kept])
-    best = cost.argmin(axis=1)
-    gain = (cost[:, 0] - cost.min(axis=1)) * (search.coarse() / noise) ** 2
-    hope = gain > np.maximum(_HOPE * total, 1.0)
-    radius = np.maximum(radii[best], 0.5 * search.spacing)
-    total = np.bincount(pair, minlength=pairs)
-    ends = np.cumsum(total)
-    task = np.column_stack([zones.pairs, ends - total, ends])[hope]
-    now, none = np.zeros((pairs, 4)), np.zeros((pairs, 4))
-    shape = np.column_stack([radius, hollow])[hope]
+    task = tasks(zones.pairs, pair)
+    cost, _ = search.tried(task, radii, around.hollow, point)
+    radius = np.maximum(radii[cost.argmin(axis=1)], least)
+    unit = (search.coarse() / search.noise) ** 2
+    total = task[:, 3] - task[:, 2]
+    hope = (cost[:, 0] - cost.min(axis=1)) * unit > np.maximum(_HOPE * total, 1.0)
+    # What the noise of few points hides may show among more.
+    unsure = ~hope & (total >= _FEWEST) & ~smooth_pairs(search, zones.pairs, around.turn)
+    again = np.flatnonzero(unsure)
+    point, pair = around.thinned(_SOME)
+    cost, _ = search.tried(
+        tasks(zones.pairs, pair)[again], radii[::_SKIP], around.hollow[again], point
+    )
+    hope[again] = (cost[:, 0] - cost.min(axis=1)) * unit > _SURE
+    radius[again] = np.maximum(radii[::_SKIP][cost.argmin(axis=1)], least)
+    return radius, hope
+
+
+def fit_balls(
+    search: Search,
+    zones: Zones,
+    around: Around,
+    guess: tuple[np.ndarray, np.ndarray],
+    *,
+    last: bool,
+) -> Fit:
+    """Fit a ball to the points around the edge of every pair; to more of them at ``last``."""
+    pairs, noise = len(zones.pairs), search.noise
+    radius, hope = guess[0].copy(), guess[1]
+    point, pair = around.thinned(_SOME)
+    task = tasks(zones.pairs, pair)
+    shape = np.column_stack([radius, around.hollow])[hope]
     cap = CAP * noise
-    none[hope] = search.sums(task, shape * [0.0, 1.0], point, cap)
     # From the tolerance that radii were tried with down to that of the noise: where this is small
     # no point lies within it of a ball whose radius is only about right.
-    for wide in np.append(np.geomspace(search.coarse(), cap, _NEWTON - 2), cap):
-        now[hope] = search.sums(task, shape, point, wide)
-        step = -now[hope, 1] / np.maximum(now[hope, 2], 1e-12)
+    tolerances = np.append(np.geomspace(search.coarse(), cap, _NEWTON - 2), cap)
+    for turn, wide in enumerate(tolerances):
+        if last and turn == len(tolerances) - 1:
+            point, pair = around.point, around.pair
+            task = tasks(zones.pairs, pair)
+        now = search.sums(task[hope], shape, point, wide)
+        step = -now[:, 1] / np.maximum(now[:, 2], 1e-12)
         least = 0.2 * shape[:, 0]
         shape[:, 0] = np.clip(shape[:, 0] + np.clip(step, -least, least), 0.02, 2.0 * search.limit)
-    now[hope] = search.sums(task, shape, point, cap)
+    now, none = np.zeros((pairs, 4)), np.zeros((pairs, 4))
+    now[hope] = search.sums(task[hope], shape, point, cap)
+    none[hope] = search.sums(task[hope], shape * [0.0, 1.0], point, cap)
     radius[hope] = shape[:, 0]
+    total = np.maximum(task[:, 3] - task[:, 2], 1)
     gain = (none[:, 0] - now[:, 0]) / noise**2
-    rms = np.sqrt(now[:, 0] / np.maximum(total, 1))
-    good = hope & (
-        (gain * every >= _GAIN * np.maximum(total, 1))
-        & (gain >= _EACH * now[:, 3])
-        & (radius * turn >= _ARC * search.spacing)
-        & (radius <= _SLACK * search.limit)
+    # The mean square of the distances from a ball to the sharp edge within it.
+    wide = radius * (1.0 / np.cos(np.minimum(around.turn, _STEEP) / 2.0) - 1.0)
+    each = np.clip(_EXPECTED * wide**2 / (5.0 * noise**2), *_EACH)
+    rms = np.sqrt(now[:, 0] / total)
+    rounded = hope & (
+        (gain * around.every >= _GAIN * total)
+        & (gain >= each * now[:, 3])
+        & (radius * around.turn >= _ARC * search.spacing)
         & (now[:, 3] >= _FEWEST)
     )
+    small = radius <= SLACK * search.limit
     return Fit(
-        radius=radius * hollow,
+        radius=radius * around.hollow,
         deviation=_SHARED * np.maximum(rms, 0.3 * noise) / np.sqrt(np.maximum(now[:, 2], 1e-12)),
-        hollow=hollow,
-        turn=turn,
-        points=total,
-        good=good,
-        quality=np.clip(1.5 - rms / (2.0 * noise), 0.1, 1.0),
+        hollow=around.hollow,
+        turn=around.turn,
+        points=task[:, 3] - task[:, 2],
+        good=rounded & small,
+        large=rounded & ~small & (rms <= _ALIKE * search.usual()),
     )
+
+
+def tasks(pairs: np.ndarray, pair: np.ndarray) -> np.ndarray:
+    """Return both surfaces of every pair and the range of its entries, shape (P, 4)."""
+    total = np.bincount(pair, minlength=len(pairs))
+    ends = np.cumsum(total)
+    return np.column_stack([pairs, ends - total, ends])
 
 
 def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
@@ -144,21 +219,32 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
     better = ball <= _WORSE**2 * own + (_EVEN * search.noise) ** 2 * number
     side = (search.label[point][:, None] == zones.pairs[pair]).any(axis=1)
     kept = better[of] | side
-    others = np.bincount(pair, ~side, len(zones.pairs))
-    agree = 2.0 * np.bincount(pair, kept & ~side, len(zones.pairs)) >= others
+    pairs = len(zones.pairs)
+    spared, wrong = kept & ~side, ~kept
+    agree = np.bincount(pair, wrong, pairs) <= np.maximum(
+        np.bincount(pair, spared, pairs), _FOREIGN * np.bincount(pair, side, pairs)
+    )
     point, pair = point[kept], pair[kept]
-    ends = np.searchsorted(pair, np.arange(len(zones.pairs) + 1))
+    ends = np.searchsorted(pair, np.arange(pairs + 1))
     support = np.diff(ends)
+    # A ball that explains its points as well as surfaces do theirs goes before one that does not.
+    square = np.bincount(pair, at.off[on][kept] ** 2, pairs) / np.maximum(support, 1)
+    quality = np.clip(2.0 - square / max(search.usual() ** 2, 1e-12), 0.1, 1.0)
     search.claim[:] = NONE
-    chosen = np.zeros(len(zones.pairs), bool)
-    for p in np.argsort(-support * fit.quality, kind="stable"):
+    chosen, taken = np.zeros(pairs, bool), np.zeros(search.count, np.int64)
+    for p in np.argsort(-support * quality, kind="stable"):
         if support[p] < _FEWEST or not agree[p]:
+            continue
+        # The strip of another fillet is a side only of a ball that fits as well as surfaces do.
+        strip = taken[zones.pairs[p]] >= _STRIP_SHARE * search.size[zones.pairs[p]]
+        if strip.any() and quality[p] < _FITS:
             continue
         mine = point[ends[p] : ends[p + 1]]
         fresh = mine[search.claim[mine] < 0]
         if len(fresh) < max(_FRESH * len(mine), _FEWEST):
             continue
         search.claim[fresh] = p
+        taken += np.bincount(search.label[fresh] + 1, minlength=search.count + 1)[1:]
         chosen[p] = True
     drop_weak_claims(search, zones, fit)
     return chosen
@@ -173,14 +259,32 @@ def drop_weak_claims(search: Search, zones: Zones, fit: Fit) -> None:
     mine = np.flatnonzero(search.claim >= 0)
     pair = search.claim[mine]
     side = (search.label[mine][:, None] == zones.pairs[pair]).any(axis=1)
-    weak = side & (search.off[mine] <= WEAK * search.noise)
-    mark = search.claim.copy()
-    mark[mine[weak]] = NONE
-    mine, pair = mine[weak], pair[weak]
-    leaf = search.leaf_of(mine)
-    reach = np.sqrt(2.0 * ON * search.noise * np.abs(fit.radius[pair])) + search.spacing
-    far = nearest_marked(search.device[0], mark, search.leaves, search.box, mine, leaf, pair, reach)
-    search.claim[mine[~np.isfinite(far)]] = NONE
+    # Where no point of the ball is far from the sides that tells nothing.
+    deep = np.abs(fit.radius) * (1.0 - np.cos(fit.turn / 2.0)) >= (WEAK + 1.0) * search.noise
+    weak = side & deep[pair] & (search.off[mine] <= WEAK * search.noise)
+    radius = np.abs(fit.radius[pair[weak]])
+    search.claim[without_support(search, search.claim, mine[weak], radius)] = NONE
+
+
+def without_support(
+    search: Search, mark: np.ndarray, weak: np.ndarray, radius: np.ndarray
+) -> np.ndarray:
+    """Return which weak points have no other one with the same mark near them.
+
+    Args:
+        search: What is known.
+        mark: Mark of every point, shape (n,), i32.
+        weak: Points that may as well lie on the surface beside, shape (E,).
+        radius: Radius of the fillet that each may lie on [mm], shape (E,).
+    """
+    strong = mark.copy()
+    strong[weak] = NONE
+    leaf = search.leaf_of(weak)
+    reach = np.sqrt(2.0 * ON * search.noise * radius) + search.spacing
+    far = nearest_marked(
+        search.device[0], strong, search.leaves, search.box, weak, leaf, mark[weak], reach
+    )
+    return weak[~np.isfinite(far)]
 
 
 def refit_sides(search: Search) -> None:
@@ -219,3 +323,17 @@ def strips_of(search: Search, number: np.ndarray) -> np.ndarray:
     table = np.bincount(key, minlength=search.count * max(fillets, 1)).reshape(search.count, -1)
     most = table.sum(axis=1) >= np.maximum(_STRIP_SHARE * search.size, 1)
     return np.where(most, table.argmax(axis=1), NONE).astype(np.int32)
+
+
+def smooth_pairs(search: Search, pairs: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Say which pairs of surfaces meet without an angle, as far as their errors tell, (P,) bool."""
+    kind = search.table[:, 8].astype(np.int32)
+    curved = np.full(search.count, np.inf)
+    ball = (kind == int(SurfaceKind.CYLINDER)) | (kind == int(SurfaceKind.SPHERE))
+    ring = kind == int(SurfaceKind.TORUS)
+    curved[ball], curved[ring] = search.table[ball, 6], search.table[ring, 7]
+    # An error of place as large as the noise opens a tangent joint by this angle.
+    radius = np.maximum(curved[pairs].min(axis=1), 1e-9)
+    open_ = np.maximum(_SMOOTH, np.sqrt(4.0 * search.noise / radius))
+    flat = (kind[pairs] == int(SurfaceKind.PLANE)).all(axis=1)
+    return ~flat & (turn < open_)

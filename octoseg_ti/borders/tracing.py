@@ -6,8 +6,9 @@ only unknown. Balls that explain points which neither surface explains are fille
 supported first: each claims the points on it, and what is left has to support the next.
 
 A fillet has a radius of up to `EdgeParams.fillet_radius`, turns over at least two point spacings,
-and touches the surfaces on both of its sides. A round joint that is larger is a patch like any
-other, and so are cylinders that touch nothing along their sides: bosses, holes.
+and touches the surfaces on both of its sides. Where fillets meet, blends between them belong to no
+pair (`borders.blends`). A round joint that is larger is a patch like any other, and so are
+cylinders that touch nothing along their sides: bosses, holes.
 """
 
 from __future__ import annotations
@@ -16,18 +17,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octoseg_ti.borders.fillets import ON, WEAK, Fit, claim_points, fit_balls, refit_sides, strips_of
+from octoseg_ti.borders.blends import find_blends, mark_blends
+from octoseg_ti.borders.fillets import (
+    ON,
+    WEAK,
+    Fit,
+    claim_points,
+    fit_balls,
+    guess_radii,
+    look_around,
+    refit_sides,
+    smooth_pairs,
+    strips_of,
+)
 from octoseg_ti.borders.rims import mark_rims
 from octoseg_ti.borders.zones import CAP, EDGE, Search, Zones, find_zones, ranges
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.stages.marking import nearest_marked
 from octoseg_ti.stages.profiles import BALL
 from octoseg_ti.stages.rims import Lines
-from octoseg_ti.types import NONE, EdgeClass, SurfaceKind
+from octoseg_ti.types import NONE, EdgeClass
 
 # Rounds of claims; between them surfaces are fitted anew without what was claimed.
 _ROUNDS = 2
-_SMOOTH = 0.09  # surfaces that meet at a smaller angle [rad] meet smoothly, if one is curved
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,11 +71,13 @@ def find_borders(search: Search, lines: Lines | None = None) -> Borders:
         lines: The points in scan order, to find edges of which one face was scanned; None = these
             are not looked for.
     """
+    zones = find_zones(search)
+    around = look_around(search, zones)
+    guess = guess_radii(search, zones, around)
     for turn in range(_ROUNDS):
         if turn:
             refit_sides(search)
-        zones = find_zones(search)
-        fit = fit_balls(search, zones)
+        fit = fit_balls(search, zones, around, guess, last=turn == _ROUNDS - 1)
         chosen = claim_points(search, zones, fit)
     fillets = np.flatnonzero(chosen)
     number = np.full(len(zones.pairs) + 1, NONE, np.int32)
@@ -120,7 +134,8 @@ def mark_points(
     """Return the `EdgeClass` of every point: that of the nearest edge within two spacings."""
     leaves, reach = search.leaves, EDGE * search.spacing
     radius = np.where(chosen, fit.radius, 1e-12 * fit.hollow)
-    smooth = ~chosen & (smooth_pairs(search, zones.pairs, fit.turn) | (fit.points < 5))
+    smooth = smooth_pairs(search, zones.pairs, fit.turn) | fit.large | (fit.points < 5)
+    smooth &= ~chosen
     idle = ~chosen & (strip[zones.pairs] >= 0).any(axis=1) & smooth
     # The leaves of the zones, and those that touch them.
     more = ~smooth[zones.pair]
@@ -178,19 +193,7 @@ def mark_points(
     order = np.argsort(-np.where(smooth[pair], reach, along), kind="stable")
     edge = np.zeros(len(search.points), np.uint8)
     edge[point[order]] = code[pair[order]]
+    blend = find_blends(search, zones, fit.turn) & (strip < 0)
+    mark_blends(search, zones, blend, smooth, edge)
     edge[search.claim >= 0] = int(EdgeClass.FILLET)
     return edge
-
-
-def smooth_pairs(search: Search, pairs: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Say which pairs of surfaces meet without an angle, as far as their errors tell, (P,) bool."""
-    kind = search.table[:, 8].astype(np.int32)
-    curved = np.full(search.count, np.inf)
-    ball = (kind == int(SurfaceKind.CYLINDER)) | (kind == int(SurfaceKind.SPHERE))
-    ring = kind == int(SurfaceKind.TORUS)
-    curved[ball], curved[ring] = search.table[ball, 6], search.table[ring, 7]
-    # An error of place as large as the noise opens a tangent joint by this angle.
-    radius = np.maximum(curved[pairs].min(axis=1), 1e-9)
-    open_ = np.maximum(_SMOOTH, np.sqrt(4.0 * search.noise / radius))
-    flat = (kind[pairs] == int(SurfaceKind.PLANE)).all(axis=1)
-    return ~flat & (turn < open_)

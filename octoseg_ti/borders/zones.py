@@ -15,7 +15,7 @@ from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.stages.extraction import Surfaces
 from octoseg_ti.stages.labelling import label_lists, near_lists
 from octoseg_ti.stages.leaves import Leaves, members_of
-from octoseg_ti.stages.profiles import NOWHERE, Places, place, sums
+from octoseg_ti.stages.profiles import BALL, NOWHERE, Places, place, sums
 from octoseg_ti.stages.sets import spread
 from octoseg_ti.types import NONE
 
@@ -25,9 +25,10 @@ EDGE = 2.0
 """Edge points are this near an edge [spacings]."""
 
 # Samples of a patch that tell its side, and of a strip that tell what it lies between.
-_SIDE, _STRIP = 200, 60
-# A strip lies between two surfaces when this share of its samples does.
-_BETWEEN = 0.3
+_SIDE, _STRIP = 200, 100
+# So many of its samples lie on a ball between two surfaces (or this share of all its points, where
+# these are few), and of those between the lines of contact this share.
+_LOCAL, _BETWEEN, _MOSTLY = 8, 0.3, 0.5
 # Radii that are tried: from the least [spacings] up to so many limits.
 _LEAST, _MOST = 1.0, 1.35
 _RATIO = 1.3  # each larger by this ratio: a strip is only to be recognised
@@ -49,6 +50,8 @@ class Zones(NamedTuple):
     """Pair and label of points that may lie on the edge, as one number, ascending."""
     width: int
     """Labels are below this."""
+    contact: np.ndarray
+    """Leaves where both patches of every pair are near, shape (P,)."""
 
     def allows(self, pair: np.ndarray, label: np.ndarray) -> np.ndarray:
         """Say which points may lie on an edge: those of its sides, its strips, of no patch."""
@@ -169,6 +172,11 @@ class Search:
         """Return how wide a piece of a fillet may pass as a part of the surface beside it [mm]."""
         return float(np.sqrt(2.0 * CAP * self.noise * self.limit)) + 1.5 * self.spacing
 
+    def usual(self) -> float:
+        """Return how far points are from the surfaces of their patches [mm]."""
+        off = self.off[self.label >= 0]
+        return float(np.sqrt(np.mean(off**2))) if len(off) else self.noise
+
     def radii(self, ratio: float) -> np.ndarray:
         """Return the radii that are tried, each larger than the last by this ratio."""
         least = _LEAST * self.spacing
@@ -225,6 +233,9 @@ def pairs_near(near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def strips_between(search: Search, touching: np.ndarray) -> np.ndarray:
     """Return patches that lie on a ball between two of the patches they touch, shape (S, 3).
 
+    A patch may be the strip of several edges, one after the other: for each of them only the
+    points near it count.
+
     Args:
         search: What is known.
         touching: Pairs of patches that touch, each once.
@@ -238,27 +249,29 @@ def strips_between(search: Search, touching: np.ndarray) -> np.ndarray:
         triples.append(np.column_stack([np.full(len(i), s), sides[i], sides[j]]))
     triple = np.concatenate(triples)
     samples = [spread(m, _STRIP) for m in search.members]
-    size = np.array([len(s) for s in samples])
-
-    def listed_for(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return listed([samples[s] for s in rows[:, 0]])
-
     if len(triple) == 0:
         return triple
-    entry, owner = listed_for(triple)
+    entry, owner = listed([samples[s] for s in triple[:, 0]])
     at = search.place(triple[:, 1:], np.zeros(len(triple)), entry, owner)
     inside = (at.region != NOWHERE) & (at.along <= search.reach(at.turn))
     height = np.bincount(owner, inside * np.sign(at.height), len(triple))
-    kept = np.bincount(owner, inside, len(triple)) >= _BETWEEN * size[triple[:, 0]]
-    triple, hollow = triple[kept], np.where(height[kept] < 0.0, -1.0, 1.0)
+    fewest = np.minimum(_LOCAL, _BETWEEN * search.size[triple[:, 0]])
+    kept = np.bincount(owner, inside, len(triple)) >= fewest
+    entry, owner = entry[inside & kept[owner]], (np.cumsum(kept) - 1)[owner[inside & kept[owner]]]
+    triple, fewest = triple[kept], fewest[kept]
+    hollow = np.where(height[kept] < 0.0, -1.0, 1.0)
     if len(triple) == 0:
         return triple
-    entry, _ = listed_for(triple)
-    ends = np.cumsum(size[triple[:, 0]])
-    task = np.column_stack([triple[:, 1:], ends - size[triple[:, 0]], ends])
-    cost, on = search.tried(task, search.radii(_RATIO), hollow, entry)
+    total = np.bincount(owner, minlength=len(triple))
+    ends = np.cumsum(total)
+    task = np.column_stack([triple[:, 1:], ends - total, ends])
+    radii = search.radii(_RATIO)
+    cost, on = search.tried(task, radii, hollow, entry)
     best = (on - cost).argmax(axis=1)
-    return triple[on[np.arange(len(triple)), best] >= _BETWEEN * size[triple[:, 0]]]
+    at = search.place(triple[:, 1:], hollow * radii[best], entry, owner)
+    between = np.bincount(owner, at.region == BALL, len(triple))
+    on = on[np.arange(len(triple)), best]
+    return triple[(on >= fewest) & (on >= _MOSTLY * between)]
 
 
 def find_zones(search: Search) -> Zones:
@@ -267,20 +280,16 @@ def find_zones(search: Search) -> Zones:
     width, cells = search.count + 1, len(search.leaves)
     touching = np.unique(pairs[:, 0].astype(np.int64) * width + pairs[:, 1])
     triple = strips_between(search, np.column_stack([touching // width, touching % width]))
-    cell, rank = np.nonzero(search.own >= 0)
-    name = search.own[cell, rank]
-    order = np.argsort(name, kind="stable")
-    cell, first = cell[order], np.searchsorted(name[order], np.arange(search.count + 1))
-    each = (first[1:] - first[:-1])[triple[:, 0]]
-    along = cell[ranges(first[triple[:, 0]], each)]
+    between, along = leaves_between(search, triple)
     # Large leaves are far inside a patch: their points say nothing about its edges.
     size = search.leaves.size
     small = size <= max(2.0 * size.min(), search.absorbed())
     real = search.analytic[pairs].all(axis=1)
+    met = pairs[real, 0].astype(np.int64) * width + pairs[real, 1]
     key = np.concatenate(
         [
-            (pairs[real, 0].astype(np.int64) * width + pairs[real, 1]) * cells + leaf[real],
-            np.repeat(triple[:, 1] * width + triple[:, 2], each) * cells + along,
+            met * cells + leaf[real],
+            (triple[between, 1] * width + triple[between, 2]) * cells + along,
         ]
     )
     key = np.unique(key)
@@ -296,7 +305,26 @@ def find_zones(search: Search) -> Zones:
              between * width + triple[:, 0]]
         )
     )  # fmt: skip
-    return Zones(pairs, which, key % cells, fine, labels, width)
+    met = np.bincount(np.searchsorted(code, met), minlength=len(code))
+    return Zones(pairs, which, key % cells, fine, labels, width, met)
+
+
+def leaves_between(search: Search, triple: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the leaves of strips near the edges they lie on, and the triple of each."""
+    cell, rank = np.nonzero(search.own >= 0)
+    name = search.own[cell, rank]
+    order = np.argsort(name, kind="stable")
+    cell, first = cell[order], np.searchsorted(name[order], np.arange(search.count + 1))
+    each = (first[1:] - first[:-1])[triple[:, 0]]
+    leaf, owner = cell[ranges(first[triple[:, 0]], each)], np.repeat(np.arange(len(triple)), each)
+    low, high = search.box[:, :3], search.box[:, 3:]
+    wide = 0.5 * np.linalg.norm(high - low, axis=1)
+    # How far fillets reach at most: the nearer ones are picked where points are placed.
+    near = search.near_edge(
+        triple[:, 1:], np.zeros(len(triple)), 0.5 * (low + high), leaf, owner,
+        search.reach(np.full(1, np.pi)) + wide[leaf],
+    )  # fmt: skip
+    return owner[near], leaf[near]
 
 
 def points_of(search: Search, zones: Zones, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -85,8 +85,8 @@ def _lie_on(
             near = ti.select(ti.abs(d) <= limit, ti.max(1.0 - share * share, _LEAST), 0.0)
             if m.norm_sqr() > 0.0:
                 facing = ti.abs(n.dot(m))
-                turned = (1.0 - facing) / (1.0 - cosine)
-                near = ti.select(facing >= cosine, ti.max(near * (1.0 - turned), near * _LEAST), 0.0)
+                turned = (1.0 - facing) / ti.max(1.0 - cosine, _LEAST)
+                near *= ti.select(facing >= cosine, ti.max(1.0 - turned, _LEAST), 0.0)
             near_out[range_in[s, 2] + j - range_in[s, 0]] = ti.cast(near, ti.f32)
 
 

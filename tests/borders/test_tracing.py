@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from reference.rounded import bend
 
 from octoseg_ti import evaluate, segment
 from octoseg_ti.evaluation import Scores
@@ -20,21 +21,6 @@ from scanner_sim.part import (
     sphere,
     union,
 )
-
-
-def bend(radius: float, turn_deg: float, *, fillet: bool, wide: float = 8.0) -> Part:
-    """A ridge of two planes along x, rounded by a cylinder."""
-    limits = box((-wide, -wide, -20), (wide, wide, 5))
-    half = math.radians(turn_deg) / 2.0
-    sides = [half_space((0, 0, 0), (0, sign * math.sin(half), math.cos(half))) for sign in (-1, 1)]
-    wedge = intersection(*sides)
-    if radius == 0.0:
-        return intersection(wedge, limits)
-    top = -radius * math.tan(half) * math.sin(half)
-    roll = cylinder((0, 0, -radius / math.cos(half)), (1, 0, 0), radius, fillet=fillet)
-    below = intersection(wedge, half_space((0, 0, top), (0, 0, 1)))
-    above = intersection(wedge, roll, half_space((0, 0, top), (0, 0, -1)))
-    return intersection(union(below, above), limits)
 
 
 def s_blend(radius: float, turn_deg: float, wide: float = 6.0) -> Part:
