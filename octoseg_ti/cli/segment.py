@@ -15,7 +15,8 @@ from octoseg_ti.cli.output import out, out_json, progress, size_of
 from octoseg_ti.params import PRESETS, Params
 
 if TYPE_CHECKING:
-    from octoseg_ti.types import Registration, Segmentation, Truth
+    from octoseg_ti.alignment import Registration
+    from octoseg_ti.types import Segmentation, Truth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

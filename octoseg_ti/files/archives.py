@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from octoseg_ti.alignment import Registration
 from octoseg_ti.params import Params
-from octoseg_ti.types import Cells, Fillets, Measurement, Registration, Scans, Segmentation, Truth
+from octoseg_ti.types import Cells, Fillets, Measurement, Scans, Segmentation, Truth
 
 _SAMPLE = 2048
 _NOISE = 0.95  # deflate would save less than this leaves

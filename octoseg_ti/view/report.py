@@ -20,9 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from octoseg_ti.alignment import Registration
 from octoseg_ti.errors import DataError
 from octoseg_ti.evaluation import Scores
-from octoseg_ti.types import Registration, Segmentation, StopReason, SurfaceKind, Truth
+from octoseg_ti.types import Segmentation, StopReason, SurfaceKind, Truth
 from octoseg_ti.view.scene import finite_rows
 from octoseg_ti.view.stream import replaced
 
