@@ -263,6 +263,28 @@ class Segmentation:
     """Surface parameters of every patch, shape (K, 8), f64: point (3), axis or normal (3), a, b;
     a = radius (cylinder, sphere, torus ring), half angle (cone); b = tube radius (torus). NaN where
     there is none."""
+    covariance: np.ndarray
+    """Covariance of these parameters, shape (K, 8, 8), f64: rows and columns in their order, point
+    [mm], axis or normal (components of a unit vector, so that small deviations are angles [rad]),
+    a [mm; cone: rad], b [mm]. NaN in the rows and columns of what a kind has not (plane: a and b;
+    sphere: axis and b; cylinder, cone: b), and everywhere for a free form, no kind, or too few
+    points.
+
+    To first order: s^2 (J'J)^-1 over the points that the surface was fitted to (at most a few
+    hundred, evenly spread over all its patches, which share one covariance; all points of a plane
+    found without the search for surfaces). s is what these points leave, not what was assumed; on
+    exact data that is rounding. It takes their errors for independent. What neighbours share is not
+    in it: errors of the poses, of the calibration, of a whole stripe or view, or of the form
+    (`measured.view_noise` is the part that the views show). Nor is the choice of kind and points.
+    Short arcs, of which centre or apex are far from sure, err more than the first order says.
+
+    It is singular: a unit vector changes only across itself; the point of a plane only along the
+    normal, that of a cylinder only across the axis, for elsewhere it is free. So compare with the
+    nearest point of another such surface, and invert by the eigenvalues that are not rounding. It
+    holds at the point given: the offset n.p of a plane has the variance g C g', g = (n, p, 0, 0),
+    which grows with the distance of the origin from the points. A shift of the frame changes
+    nothing, a turn R gives M C M' with M = diag(R, R, 1, 1), and the opposite normal M = diag(1,
+    -1, 1, 1)."""
     residual: np.ndarray
     """Root mean square distance of the points to the surface [mm], shape (K,); NaN = none."""
     cells: Cells
@@ -299,6 +321,11 @@ class Segmentation:
     def patch_sizes(self) -> np.ndarray:
         """Points of every patch, shape (K,), i64."""
         return np.bincount(self.labels[self.labels >= 0], minlength=self.patch_count)
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Standard deviation of every parameter by `covariance`, shape (K, 8); NaN = none."""
+        return np.sqrt(np.einsum("kii->ki", self.covariance))
 
     @property
     def level_count(self) -> int:

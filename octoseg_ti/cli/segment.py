@@ -122,7 +122,7 @@ def summary(result: Segmentation) -> dict[str, Any]:
 
     from octoseg_ti.types import SurfaceKind
 
-    sizes = result.patch_sizes
+    sizes, deviation = result.patch_sizes, result.deviation
     return {
         "points": len(result),
         "patches": result.patch_count,
@@ -139,6 +139,8 @@ def summary(result: Segmentation) -> dict[str, Any]:
                 "surface": int(result.surface[k]),
                 "points": int(sizes[k]),
                 "rms_mm": float(result.residual[k]),
+                "parameters": result.parameters[k],
+                "deviations": deviation[k],
             }
             for k in range(result.patch_count)
         ],
