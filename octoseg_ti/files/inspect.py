@@ -172,12 +172,12 @@ def _result_facts(path: Path) -> dict[str, Any]:
 
 def _possible(covariance: np.ndarray) -> np.ndarray:
     """Say which matrices may be covariances, shape (K,): symmetric, no correlation beyond 1."""
-    matrix = np.nan_to_num(covariance, nan=0.0)
+    finite = ~np.isinf(covariance).any(axis=(1, 2))
+    matrix = np.where(np.isfinite(covariance), covariance, 0.0)
     deviation = np.sqrt(np.maximum(np.einsum("kii->ki", matrix), 0.0))
     most = (1.0 + 1e-6) * deviation[:, :, None] * deviation[:, None, :]
-    fits = np.isfinite(matrix) & (np.abs(matrix) <= most)
     mirrored = np.swapaxes(matrix, 1, 2) == matrix
-    return np.asarray((fits & mirrored).all(axis=(1, 2)))
+    return np.asarray(finite & ((np.abs(matrix) <= most) & mirrored).all(axis=(1, 2)))
 
 
 def _recording_problems(path: Path) -> list[str]:
