@@ -275,8 +275,10 @@ class Segmentation:
     found without the search for surfaces). s is what these points leave, not what was assumed; on
     exact data that is rounding. It takes their errors for independent. What neighbours share is not
     in it: errors of the poses, of the calibration, of a whole stripe or view, or of the form
-    (`measured.view_noise` is the part that the views show). Nor is the choice of kind and points.
-    Short arcs, of which centre or apex are far from sure, err more than the first order says.
+    (`measured.view_noise` is the part that the views show). Nor is the choice of kind and points:
+    on simulated parts with sharp edges errors are as large as this says, beside fillets, whose ends
+    faces take with them, about twice. Short arcs, of which centre or apex are far from sure, err
+    more than the first order says.
 
     It is singular: a unit vector changes only across itself; the point of a plane only along the
     normal, that of a cylinder only across the axis, for elsewhere it is free. So compare with the
