@@ -270,8 +270,8 @@ class Segmentation:
     sphere: axis and b; cylinder, cone: b), and everywhere for a free form, no kind, or too few
     points.
 
-    To first order: s^2 (J'J)^-1 over the points that the surface was fitted to (at most a few
-    hundred, evenly spread over all its patches, which share one covariance; all points of a plane
+    To first order: s^2 (J'J)^-1 over the points that the surface was fitted to (at most a
+    thousand, evenly spread over all its patches, which share one covariance; all points of a plane
     found without the search for surfaces). s is what these points leave, not what was assumed; on
     exact data that is rounding. It takes their errors for independent. What neighbours share is not
     in it: errors of the poses, of the calibration, of a whole stripe or view, or of the form
