@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from octoseg_ti.alignment import Registration
 from octoseg_ti.errors import DataError
-from octoseg_ti.types import Registration, Scans
+from octoseg_ti.types import Scans
 
 _LONG_PIECE = 50  # rows; pieces that are shorter on average are gathered row by row
 

@@ -73,6 +73,8 @@ class Regions:
     """`SurfaceKind` of every such surface."""
     parameters: np.ndarray | None = None
     """Parameters of every such surface, relative to the corner of the grid."""
+    covariance: np.ndarray | None = None
+    """Covariance of these; where the grid begins makes no difference to it."""
     graph: Leaves | None = None
     """The leaves as a graph, when surfaces were looked for."""
     mirrored: np.ndarray | None = None
@@ -192,7 +194,7 @@ def assemble(
     rank = np.argsort(-size, kind="stable")
     name = np.full(patches + 1, NONE, np.int32)
     name[rank] = np.arange(patches, dtype=np.int32)
-    kind, parameters, residual, surface = _describe(grid, leaves, found, measured)
+    kind, parameters, covariance, residual, surface = _describe(grid, leaves, found, measured)
     n = len(scans)
     outlier = np.zeros(n, np.uint8)
     if not arranged.whole:
@@ -226,7 +228,8 @@ def assemble(
     return Segmentation(
         points=rows.points, normals=rows.normals, labels=rows.labels, edge=edge, fillets=fillets,
         level=rows.level, outlier=outlier, kind=kind[rank],
-        surface=_renumbered(surface[rank]), parameters=parameters[rank], residual=residual[rank],
+        surface=_renumbered(surface[rank]), parameters=parameters[rank],
+        covariance=covariance[rank], residual=residual[rank],
         cells=cells, stripe=scans.stripe, view=scans.view, params=params, measured=measured,
         passes=grid.passes, name=scans.name,
     )  # fmt: skip
@@ -264,20 +267,24 @@ def _fillets(
 
 def _describe(
     grid: Grid, leaves: np.ndarray, found: Regions, measured: Measurement
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return kind, parameters, residual and surface of every region."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return kind, parameters, their covariance, residual and surface of every region."""
     patches = found.count
     flat = 2.0 * measured.noise + 0.02 * spacing_of(measured)
     cell_label = found.cell_label[leaves]
-    kind, parameters, residual = fit_planes(grid, leaves, cell_label, patches, limit=flat)
+    kind, parameters, covariance, residual = fit_planes(
+        grid, leaves, cell_label, patches, limit=flat
+    )
     surface = np.arange(patches, dtype=np.int32)
     if found.surface is None or found.kind is None or found.parameters is None:
-        return kind, parameters, residual, surface
+        return kind, parameters, covariance, residual, surface
+    assert found.covariance is not None
     kind[kind == int(SurfaceKind.NONE)] = int(SurfaceKind.FREE_FORM)
     on = np.flatnonzero(found.surface >= 0)
     which = found.surface[on]
     kind[on], parameters[on] = found.kind[which], found.parameters[which]
     parameters[on, :3] += grid.corner
+    covariance[on] = found.covariance[which]
     surface[on] = which
     surface[found.surface < 0] = len(found.kind) + np.arange(patches - len(on))
     lying = found.label >= 0
@@ -288,7 +295,7 @@ def _describe(
     )
     count = np.maximum(np.bincount(region, minlength=patches), 1)
     residual[on] = np.sqrt(np.bincount(region, far**2, patches) / count)[on]
-    return kind, parameters, residual, surface
+    return kind, parameters, covariance, residual, surface
 
 
 def _renumbered(surface: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from octoseg_ti.alignment import Registration
 from octoseg_ti.arrange import Arranged, arrange, as_scans, probe_positions, without
 from octoseg_ti.borders.rims import scan_lines
 from octoseg_ti.borders.tracing import Borders, find_borders
@@ -31,7 +32,7 @@ from octoseg_ti.stages.refinement import refine_poses
 from octoseg_ti.stages.registration import to_world
 from octoseg_ti.stages.scatter import surface_noise
 from octoseg_ti.surfacing import fit_surfaces
-from octoseg_ti.types import Measurement, Registration, Scans, Segmentation
+from octoseg_ti.types import Measurement, Scans, Segmentation
 
 STAGES = (
     "cleaning", "normals", "registration", "measure", "grid", "edges", "regions", "surfaces",

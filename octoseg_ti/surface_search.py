@@ -14,6 +14,7 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
+from octoseg_ti.fitting.covariance import covariances
 from octoseg_ti.stages.extraction import Tolerance, explain
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import (
@@ -75,6 +76,8 @@ class Surfaced:
 
     surfaces: Surfaces
     """The surfaces, relative to the corner of the grid."""
+    covariance: np.ndarray
+    """Of their parameters, as `Segmentation.covariance`, shape (M, 8, 8)."""
     label: np.ndarray
     """Surface of every sorted point, -1 = none, shape (n,), i32."""
     own: np.ndarray
@@ -185,10 +188,13 @@ class _Search:
         ]
         self.fit_to(self.samples, [spread(m, _REFIT) for m in members])
 
-    def refit_settled(self) -> None:
+    def refit_settled(self) -> np.ndarray:
         """Fit the surfaces to more of their points, up to the edges: these are settled now.
 
         What chose a surface for being near it would pull it away from the edge.
+
+        Returns:
+            The covariances of their parameters, shape (M, 8, 8).
         """
         self.settled = True
         self._label = None
@@ -202,7 +208,11 @@ class _Search:
         )
         both = joined_samples(self.samples, more)
         name = np.concatenate([np.where(few[of], NONE, of), label[more.index]])
-        self.fit_to(both, [spread(m, _SETTLED) for m in members_of(name, count)])
+        sets = [spread(m, _SETTLED) for m in members_of(name, count)]
+        self.fit_to(both, sets)
+        index = np.concatenate([np.zeros(0, np.int64), *sets])
+        start = np.cumsum([0] + [len(s) for s in sets])
+        return covariances(both.point[index], start, self.surfaces.kind, self.surfaces.parameters)
 
     def fit_to(self, samples: Samples, members: list[np.ndarray]) -> None:
         """Fit the surfaces to samples, one set for each, where that explains them no worse."""
@@ -285,7 +295,9 @@ class _Search:
         """Give up surfaces that their neighbours explain; say whether there were any."""
         off = runtime.download(self.labelling.choice.off)
         second = runtime.download(self.labelling.choice.second)
-        second = np.where(off[:, 1] * self.labelling.rule.tilt <= self.labelling.rule.turn, second, NONE)
+        second = np.where(
+            off[:, 1] * self.labelling.rule.tilt <= self.labelling.rule.turn, second, NONE
+        )
         gone = explained_by_others(self.label, second, off, len(self.surfaces), EXPLAINED)
         if not gone.any():
             return False
@@ -369,12 +381,13 @@ def find_surfaces(
             break
     search.early = len(search.surfaces)
     search.choose()
-    search.refit_settled()
+    covariance = search.refit_settled()
     search.choose()
     search.give_up()
     search.give_up_slivers()
     return Surfaced(
         surfaces=search.surfaces,
+        covariance=covariance,
         label=search.label,
         own=label_lists(leaves, search.label),
         off=search.off_next(),

@@ -74,6 +74,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         surface=np.concatenate([surface, np.full(free, NONE, np.int32)]),
         kind=surfaced.surfaces.kind,
         parameters=surfaced.surfaces.parameters,
+        covariance=surfaced.covariance,
         graph=graph,
     )
 

@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from octoseg_ti.alignment import Registration as Registration
+from octoseg_ti.alignment import rotation_angle as rotation_angle
+
 if TYPE_CHECKING:
     from octoseg_ti.params import Params
 
@@ -208,93 +211,6 @@ class Measurement:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Registration:
-    """How the views were aligned to each other; ``P`` pairs of views were used."""
-
-    recorded: np.ndarray
-    """Poses as recorded: view to world, shape (V, 4, 4), f64; identity where none was given."""
-    refined: np.ndarray
-    """Poses after the refinement, shape (V, 4, 4), f64."""
-    datum: np.ndarray
-    """Views whose poses were kept fixed, one for each connected group, i32."""
-    left: np.ndarray
-    """Views left as recorded because they overlap too little with every other, i32."""
-    open: np.ndarray
-    """Directions of motion, 0..6, that the overlaps of a view leave open (one plane leaves three):
-    along these it was not moved; shape (V,), i32."""
-    pairs: np.ndarray
-    """The pairs of views that were used, shape (P, 2), i32."""
-    matches: np.ndarray
-    """Matched points of every pair after the refinement, shape (P,), i32."""
-    before: np.ndarray
-    """Root mean square distance from point to plane by the recorded poses [mm], shape (P,)."""
-    after: np.ndarray
-    """... and by the refined poses [mm], shape (P,)."""
-
-    @property
-    def rms_before(self) -> float:
-        """Distance from point to plane over all pairs by the recorded poses [mm]; NaN = no pair."""
-        return self._over_all(self.before)
-
-    @property
-    def rms_after(self) -> float:
-        """Distance from point to plane over all pairs by the refined poses [mm]; NaN = no pair."""
-        return self._over_all(self.after)
-
-    def _over_all(self, rms: np.ndarray) -> float:
-        if len(rms) == 0:
-            return float("nan")
-        return float(np.sqrt(np.average(rms**2, weights=self.matches)))
-
-    def change(self) -> np.ndarray:
-        """Return the motions of the views in the world, shape (V, 4, 4); identity = not moved."""
-        moved = (self.refined != self.recorded).any(axis=(1, 2))[:, None, None]
-        return np.where(moved, self.refined @ np.linalg.inv(self.recorded), np.eye(4))
-
-    def moves(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return by how much every pose has changed, in its own frame.
-
-        Returns:
-            Shift of the origin of the view [mm] and angle [rad], shape (V,) each.
-        """
-        moved = (self.refined != self.recorded).any(axis=(1, 2))[:, None, None]
-        change = np.where(moved, np.linalg.inv(self.recorded) @ self.refined, np.eye(4))
-        return np.linalg.norm(change[:, :3, 3], axis=1), rotation_angle(change)
-
-    def __str__(self) -> str:
-        """Say in a line what was aligned, and what was not."""
-        if len(self.pairs) == 0:
-            text = "registration: no two views overlap, all poses left as recorded"
-        else:
-            text = (
-                f"registration: {len(self.pairs)} pairs of {len(self.recorded)} views, rms "
-                f"{self.rms_before:.4f} -> {self.rms_after:.4f} mm"
-            )
-            if len(self.left):
-                text += f", left as recorded (too little overlap): {_listed(self.left)}"
-        loose = np.flatnonzero(self.open)
-        if len(loose):
-            text += f", not held in every direction: {_listed(loose)}"
-        return text
-
-
-def rotation_angle(motion: np.ndarray) -> np.ndarray:
-    """Return by how much rigid motions of shape (..., 4, 4) turn [rad], shape (...)."""
-    turn = motion[..., :3, :3]
-    # The sine of a small angle, from the skew part, is exact where the cosine is not.
-    skew = turn - np.swapaxes(turn, -1, -2)
-    sine = np.linalg.norm(skew, axis=(-2, -1)) / np.sqrt(8.0)
-    cosine = (np.trace(turn, axis1=-2, axis2=-1) - 1.0) / 2.0
-    angle: np.ndarray = np.arctan2(sine, cosine)
-    return angle
-
-
-def _listed(views: np.ndarray) -> str:
-    """Return the numbers of views as text."""
-    return ("view " if len(views) == 1 else "views ") + ", ".join(map(str, views.tolist()))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fillets:
     """The fillets of a part: strips that a ball leaves that rolls along two patches; ``F`` of them.
 
@@ -347,6 +263,30 @@ class Segmentation:
     """Surface parameters of every patch, shape (K, 8), f64: point (3), axis or normal (3), a, b;
     a = radius (cylinder, sphere, torus ring), half angle (cone); b = tube radius (torus). NaN where
     there is none."""
+    covariance: np.ndarray
+    """Covariance of these parameters, shape (K, 8, 8), f64: rows and columns in their order, point
+    [mm], axis or normal (components of a unit vector, so that small deviations are angles [rad]),
+    a [mm; cone: rad], b [mm]. NaN in the rows and columns of what a kind has not (plane: a and b;
+    sphere: axis and b; cylinder, cone: b), and everywhere for a free form, no kind, or too few
+    points.
+
+    To first order: s^2 (J'J)^-1 over the points that the surface was fitted to (at most a
+    thousand, evenly spread over all its patches, which share one covariance; all points of a plane
+    found without the search for surfaces). s is what these points leave, not what was assumed; on
+    exact data that is rounding. It takes their errors for independent. What neighbours share is not
+    in it: errors of the poses, of the calibration, of a whole stripe or view, or of the form
+    (`measured.view_noise` is the part that the views show). Nor is the choice of kind and points:
+    on simulated parts with sharp edges errors are as large as this says, beside fillets, whose ends
+    faces take with them, about twice. Short arcs, of which centre or apex are far from sure, err
+    more than the first order says.
+
+    It is singular: a unit vector changes only across itself; the point of a plane only along the
+    normal, that of a cylinder only across the axis, for elsewhere it is free. So compare with the
+    nearest point of another such surface, and invert by the eigenvalues that are not rounding. It
+    holds at the point given: the offset n.p of a plane has the variance g C g', g = (n, p, 0, 0),
+    which grows with the distance of the origin from the points. A shift of the frame changes
+    nothing, a turn R gives M C M' with M = diag(R, R, 1, 1), and the opposite normal M = diag(1,
+    -1, 1, 1)."""
     residual: np.ndarray
     """Root mean square distance of the points to the surface [mm], shape (K,); NaN = none."""
     cells: Cells
@@ -383,6 +323,11 @@ class Segmentation:
     def patch_sizes(self) -> np.ndarray:
         """Points of every patch, shape (K,), i64."""
         return np.bincount(self.labels[self.labels >= 0], minlength=self.patch_count)
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Standard deviation of every parameter by `covariance`, shape (K, 8); NaN = none."""
+        return np.sqrt(np.einsum("kii->ki", self.covariance))
 
     @property
     def level_count(self) -> int:

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from octoseg_ti.alignment import Registration
 from octoseg_ti.arrange import arrange, as_scans, probe_positions, without
 from octoseg_ti.errors import DataError
-from octoseg_ti.types import Registration, Scans
+from octoseg_ti.types import Scans
 
 POINTS = np.random.default_rng(0).uniform(0, 9, (12, 3))
 

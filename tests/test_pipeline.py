@@ -60,6 +60,10 @@ def test_the_answer_is_consistent(block, answer: Segmentation) -> None:
     assert answer.parameters.shape == (k, 8) and answer.residual.shape == (k,)
     planes = answer.kind == SurfaceKind.PLANE
     assert np.all(np.isfinite(answer.residual[planes]))
+    assert answer.covariance.shape == (k, 8, 8) and answer.deviation.shape == (k, 8)
+    known = np.isfinite(answer.deviation)
+    assert np.all(known[planes] == [True] * 6 + [False] * 2)
+    assert not known[~np.isfinite(answer.parameters)].any()
     np.testing.assert_allclose(np.linalg.norm(answer.parameters[planes, 3:6], axis=1), 1.0)
     size = np.linalg.norm(answer.normals, axis=1)
     assert np.all((np.abs(size - 1) < 1e-6) | (size == 0))
@@ -94,7 +98,9 @@ def test_segmentation_of_the_block_is_right(block, answer: Segmentation) -> None
 def test_five_runs_give_the_same_bits(block, answer: Segmentation) -> None:
     for _ in range(4):
         again = segment(block[0])
-        for name in ("labels", "normals", "edge", "level", "outlier", "parameters", "residual"):
+        for name in (
+            "labels", "normals", "edge", "level", "outlier", "parameters", "covariance", "residual",
+        ):  # fmt: skip
             np.testing.assert_array_equal(getattr(again, name), getattr(answer, name), err_msg=name)
         np.testing.assert_array_equal(again.cells.sigma, answer.cells.sigma)
         assert again.measured == answer.measured and again.params == answer.params
@@ -113,7 +119,8 @@ def test_threads_change_no_bit(block, answer: Segmentation, tmp_path: Path) -> N
         "from octoseg_ti import Scans, segment\n"
         "f = np.load(sys.argv[2])\n"
         "r = segment(Scans(**{k: f[k] for k in f.files}, frame='view'))\n"
-        "print(hashlib.sha256(r.labels.tobytes() + r.normals.tobytes()).hexdigest())\n"
+        "whole = r.labels.tobytes() + r.normals.tobytes() + r.covariance.tobytes()\n"
+        "print(hashlib.sha256(whole).hexdigest())\n"
         "u = segment(f['points'][f['view'] == 0])\n"
         "print(hashlib.sha256(u.labels.tobytes() + u.normals.tobytes()).hexdigest())\n"
     )
@@ -126,7 +133,8 @@ def test_threads_change_no_bit(block, answer: Segmentation, tmp_path: Path) -> N
         for threads in (1, 2)
     }  # fmt: skip
     assert len(answers) == 1
-    both = hashlib.sha256(answer.labels.tobytes() + answer.normals.tobytes()).hexdigest()
+    whole = answer.labels.tobytes() + answer.normals.tobytes() + answer.covariance.tobytes()
+    both = hashlib.sha256(whole).hexdigest()
     assert answers.pop().splitlines()[0] == both
 
 

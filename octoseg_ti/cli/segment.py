@@ -15,7 +15,8 @@ from octoseg_ti.cli.output import out, out_json, progress, size_of
 from octoseg_ti.params import PRESETS, Params
 
 if TYPE_CHECKING:
-    from octoseg_ti.types import Registration, Segmentation, Truth
+    from octoseg_ti.alignment import Registration
+    from octoseg_ti.types import Segmentation, Truth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,7 +122,7 @@ def summary(result: Segmentation) -> dict[str, Any]:
 
     from octoseg_ti.types import SurfaceKind
 
-    sizes = result.patch_sizes
+    sizes, deviation = result.patch_sizes, result.deviation
     return {
         "points": len(result),
         "patches": result.patch_count,
@@ -138,6 +139,8 @@ def summary(result: Segmentation) -> dict[str, Any]:
                 "surface": int(result.surface[k]),
                 "points": int(sizes[k]),
                 "rms_mm": float(result.residual[k]),
+                "parameters": result.parameters[k],
+                "deviations": deviation[k],
             }
             for k in range(result.patch_count)
         ],

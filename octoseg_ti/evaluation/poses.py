@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from octoseg_ti.alignment import rotation_angle
 from octoseg_ti.errors import DataError
-from octoseg_ti.types import rotation_angle
 
 
 def pose_errors(T_world_view: np.ndarray, true: np.ndarray) -> tuple[float, float]:

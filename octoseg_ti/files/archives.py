@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from octoseg_ti.alignment import Registration
 from octoseg_ti.params import Params
-from octoseg_ti.types import Cells, Fillets, Measurement, Registration, Scans, Segmentation, Truth
+from octoseg_ti.types import Cells, Fillets, Measurement, Scans, Segmentation, Truth
 
 _SAMPLE = 2048
 _NOISE = 0.95  # deflate would save less than this leaves
@@ -132,7 +133,7 @@ def result_arrays(result: Segmentation, *, per_point: bool) -> dict[str, Any]:
         for name in ("stripe", "view"):
             if getattr(result, name) is not None:
                 arrays[name] = getattr(result, name)
-    for name in ("kind", "surface", "parameters", "residual"):
+    for name in ("kind", "surface", "parameters", "covariance", "residual"):
         arrays[name] = getattr(result, name)
     cells = result.cells
     for name in _CELL_FIELDS:
@@ -196,7 +197,13 @@ def result_from_arrays(arrays: Mapping[str, Any]) -> Segmentation:
         fields[name] = np.ascontiguousarray(arrays[name], dtype)
     fields["residual"] = np.ascontiguousarray(arrays["residual"], np.float64)
     patches = len(fields["kind"])
-    for name in ("surface", "parameters", "residual"):
+    if arrays.get("covariance") is None:  # a file of an earlier version
+        fields["covariance"] = np.full((patches, 8, 8), np.nan)
+    else:
+        fields["covariance"] = np.ascontiguousarray(arrays["covariance"], np.float64)
+        if fields["covariance"].shape[1:] != (8, 8):
+            raise ValueError(f"covariance has shape {fields['covariance'].shape}, not (K, 8, 8)")
+    for name in ("surface", "parameters", "covariance", "residual"):
         if len(fields[name]) != patches:
             raise ValueError(f"{name} has {len(fields[name])} rows for {patches} patches")
     labels = fields["labels"]

@@ -96,6 +96,9 @@ def check(path: str | Path) -> list[str]:
             bad = int(np.count_nonzero((length > 0) & ~(np.abs(length - 1.0) < 1e-3)))
             if bad:
                 problems.append(f"{bad} normals of the result have no unit length")
+            bad = int(np.count_nonzero(~_possible(result.covariance)))
+            if bad:
+                problems.append(f"{bad} covariances of the result are none of any parameters")
     except DataError as error:
         problems.append(error.what + (f"; {error.hint}" if error.hint else ""))
     return problems
@@ -160,10 +163,21 @@ def _result_facts(path: Path) -> dict[str, Any]:
         "points": len(result),
         "patches": result.patch_count,
         "labelled": int(np.count_nonzero(result.labels >= 0)),
+        "covariances": int(np.isfinite(result.covariance).any(axis=(1, 2)).sum()),
         "cells": len(result.cells),
         "levels": result.level_count,
         "seconds": dict(result.seconds),
     }
+
+
+def _possible(covariance: np.ndarray) -> np.ndarray:
+    """Say which matrices may be covariances, shape (K,): symmetric, no correlation beyond 1."""
+    finite = ~np.isinf(covariance).any(axis=(1, 2))
+    matrix = np.where(np.isfinite(covariance), covariance, 0.0)
+    deviation = np.sqrt(np.maximum(np.einsum("kii->ki", matrix), 0.0))
+    most = (1.0 + 1e-6) * deviation[:, :, None] * deviation[:, None, :]
+    mirrored = np.swapaxes(matrix, 1, 2) == matrix
+    return np.asarray(finite & ((np.abs(matrix) <= most) & mirrored).all(axis=(1, 2)))
 
 
 def _recording_problems(path: Path) -> list[str]:

@@ -70,7 +70,8 @@ def write(
 ) -> None:
     """Write binary PLY: a vertex property for everything that a point has, colours by label.
 
-    A result also has an element ``patch`` with kind, surface, residual and parameters, and an
+    A result also has an element ``patch`` with kind, surface, residual, parameters, and the upper
+    triangle of their covariance by rows (``cov_px_px``, ``cov_px_py``, ... ``cov_b_b``), and an
     element ``fillet`` with the patches that a fillet runs between, its radius and the deviation of
     that.
 
@@ -89,14 +90,23 @@ def write(
 
 
 def _patch_rows(result: Segmentation) -> np.ndarray:
-    """Return a row per patch: kind, surface, residual [mm] and the eight parameters."""
+    """Return a row per patch: kind, surface, residual [mm], parameters and their covariance."""
     names = ("px", "py", "pz", "ax", "ay", "az", "a", "b")
+    pairs = {
+        f"cov_{one}_{other}": (i, j)
+        for i, one in enumerate(names)
+        for j, other in enumerate(names)
+        if i <= j
+    }
     layout = [("kind", "i1"), ("surface", "<i4"), ("residual", "<f8")]
-    patches = np.empty(result.patch_count, np.dtype(layout + [(name, "<f8") for name in names]))
+    layout += [(name, "<f8") for name in (*names, *pairs)]
+    patches = np.empty(result.patch_count, np.dtype(layout))
     for name in ("kind", "surface", "residual"):
         patches[name] = getattr(result, name)
     for i, name in enumerate(names):
         patches[name] = result.parameters[:, i]
+    for name, (i, j) in pairs.items():
+        patches[name] = result.covariance[:, i, j]
     return patches
 
 

@@ -22,7 +22,6 @@ from octoseg_ti.device.surfaces import (
     vec4,
 )
 from octoseg_ti.fitting.motions import (
-    FREE,
     STATE,
     UNKNOWNS,
     anchor_radius,
@@ -306,7 +305,7 @@ def iterate(
     rounds: int,
     whole: bool = True,
     leave: bool = True,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> np.ndarray:
     """Fit every kind to every group, from given states on.
 
     First some hundred points of each group are fitted, then all of them. A kind that is far behind
@@ -326,8 +325,7 @@ def iterate(
         leave: Leave kinds that fall behind; not for a robust fit, as outliers favour some kinds.
 
     Returns:
-        The states; and the normal equations J'WJ there, shape (G, KINDS, UNKNOWNS, UNKNOWNS), zero
-        where an unknown is not free.
+        The states, shape (G, KINDS, STATE).
     """
     runtime.ensure_started()
     groups, count = len(start) - 1, np.diff(start)
@@ -346,9 +344,4 @@ def iterate(
         run.take(other)
     if whole:
         run.improve(np.ones(groups, np.int32), rounds)
-    work = run.work.reshape(groups, KINDS, _WORK)
-    normal = np.zeros((groups, KINDS, UNKNOWNS, UNKNOWNS))
-    a, b = np.tril_indices(UNKNOWNS)
-    normal[..., a, b] = normal[..., b, a] = work[..., _NORMAL : _NORMAL + 28]
-    normal *= FREE[None, :, :, None] & FREE[None, :, None, :]
-    return work[..., :STATE], normal
+    return run.work.reshape(groups, KINDS, _WORK)[..., :STATE]

@@ -9,7 +9,7 @@ from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, ti
 from octoseg_ti.device.surfaces import CONE, CYLINDER, KINDS, SPHERE, TORUS, surface_in_row
 from octoseg_ti.fitting.descent import iterate
-from octoseg_ti.fitting.motions import FREE, moved
+from octoseg_ti.fitting.motions import FREE
 from octoseg_ti.fitting.starts import gather_moments, starts
 
 FREEDOM = FREE.sum(axis=1)
@@ -50,12 +50,6 @@ class Fits:
     """Samples, shape (G,)."""
     extent: np.ndarray
     """Root mean square distance of the samples from their centre [mm], shape (G,)."""
-    centre: np.ndarray
-    """Centre of the samples [mm], shape (G, 3)."""
-    state: np.ndarray
-    """The surfaces in units of the extent about the centre, shape (G, 5, STATE)."""
-    normal: np.ndarray
-    """J'WJ there, in these units, shape (G, 5, 7, 7); see `covariance`."""
 
 
 @ti.kernel
@@ -253,9 +247,7 @@ def fit_all(
     given = samples.points, samples.weight, start, frame
     reach = np.full((groups, KINDS), np.inf)
     first = starts(points, normals, weight, start, m)
-    state, normal = iterate(
-        *given, reach, first, rounds=_ROUNDS, whole=not robust, leave=not robust
-    )
+    state = iterate(*given, reach, first, rounds=_ROUNDS, whole=not robust, leave=not robust)
     scale = np.broadcast_to(np.asarray(noise, np.float64), groups)[:, None]
     # Least squares may have followed the outliers to a wrong place: then a start is better.
     tries = np.concatenate((state[None], first)) if robust else state[None]
@@ -270,7 +262,7 @@ def fit_all(
         if last:
             spread = np.repeat(spread.min(axis=1, keepdims=True), KINDS, axis=1)
         reach = TUKEY * spread
-        state, normal = iterate(
+        state = iterate(
             *given, reach / extent[:, None], tries, rounds=_ROUNDS, whole=last, leave=False
         )
         tries = state[None]
@@ -289,44 +281,4 @@ def fit_all(
         inside=np.where(bad, np.nan, sums[..., 1] / total),
         count=count,
         extent=extent,
-        centre=m.centre,
-        state=state,
-        normal=normal,
     )
-
-
-def covariance(fits: Fits, kind: np.ndarray) -> np.ndarray:
-    """Return the covariance of the parameters of one surface of every group.
-
-    From the normal equations: s^2 (J'WJ)^-1 with s^2 the mean square distance over the points less
-    the unknowns. It holds for independent noise, and says nothing of faults that points share.
-
-    Args:
-        fits: The fits.
-        kind: The kind wanted of every group, shape (G,), 0..4.
-
-    Returns:
-        Of (point, axis, a, b), shape (G, 8, 8) [mm^2, rad^2]; zero for what is not estimated.
-    """
-    rows = np.arange(len(kind))
-    normal, free = fits.normal[rows, kind], FREE[kind]
-    # In units of the diagonal, and with a floor: what no point holds gets a large, finite value.
-    diagonal = np.einsum("gii->gi", normal)
-    unit = np.sqrt(np.where(free & (diagonal > 0.0), diagonal, 1.0))
-    value, vector = np.linalg.eigh(normal / (unit[:, :, None] * unit[:, None, :]))
-    inverse = 1.0 / np.maximum(value, 1e-14)
-    root = vector * np.sqrt(inverse)[:, None, :] / unit[:, :, None]
-    root *= free[:, :, None]
-    count = np.maximum(fits.count - FREEDOM[kind], 1)
-    deviation = np.nan_to_num(fits.rms[rows, kind]) * np.sqrt(fits.count / count) / fits.extent
-    root *= deviation[:, None, None]
-    change = np.empty((len(kind), 8, FREE.shape[1]))
-    here = to_parameters(fits.state, fits.centre, fits.extent)
-    small = 1e-6
-    for k in range(FREE.shape[1]):
-        step = np.zeros((len(kind), KINDS, FREE.shape[1]))
-        step[..., k] = small
-        ahead = to_parameters(moved(fits.state, step), fits.centre, fits.extent)
-        change[..., k] = np.nan_to_num((ahead - here)[rows, kind]) / small
-    root = change @ root
-    return root @ np.swapaxes(root, 1, 2)

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octoseg_ti.device.surfaces import KINDS
-from octoseg_ti.fitting.primitives import FREEDOM, Fits, covariance
+from octoseg_ti.fitting.primitives import FREEDOM, Fits
 from octoseg_ti.fitting.quadrics import Quadrics
 from octoseg_ti.types import SurfaceKind
 
@@ -35,8 +34,6 @@ class Choice:
     """As in `Segmentation.parameters`, shape (G, 8); NaN where there is no kind."""
     rms: np.ndarray
     """Root mean square distance to it [mm], shape (G,); for a free form, to the best kind."""
-    covariance: np.ndarray
-    """Covariance of the parameters, shape (G, 8, 8); NaN where there is no kind."""
     side: np.ndarray
     """Sign of the agreement of the measured normals with the outward ones, shape (G,), f64: 1 for
     a boss, -1 for a hole; 0 where there is no kind."""
@@ -51,7 +48,6 @@ def choose(
     noise: float | np.ndarray,
     room: float = _ROOM,
     signed: bool = True,
-    spread: bool = True,
 ) -> Choice:
     """Choose the kind of every group.
 
@@ -66,7 +62,6 @@ def choose(
         noise: Standard deviation of a point about its surface [mm], of all or of every group, (G,).
         room: A kind fits up to this many times the noise, in rms.
         signed: Normals point to the probe, so that both sides of a sheet are no plane.
-        spread: The covariances are asked for; else they are NaN.
 
     Returns:
         The choice. Of a robust fit the loss counts, so that points out of reach speak for no kind.
@@ -90,14 +85,10 @@ def choose(
     nearest = np.argmin(np.where(possible, fits.rms, np.inf), axis=1)
     kind = np.where(found, best, int(SurfaceKind.FREE_FORM))
     kind[~possible.any(axis=1)] = int(SurfaceKind.NONE)
-    covariances = np.full((groups, 8, 8), np.nan)
-    if spread and found.any():
-        covariances[found] = covariance(fits, np.minimum(best, KINDS - 1))[found]
     return Choice(
         kind=kind.astype(np.int8),
         parameters=np.where(found[:, None], fits.parameters[rows, best], np.nan),
         rms=fits.rms[rows, np.where(found, best, nearest)],
-        covariance=covariances,
         side=np.where(found, np.sign(np.nan_to_num(fits.side[rows, best])), 0.0),
         evidence=evidence,
     )

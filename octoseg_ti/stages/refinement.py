@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from octoseg_ti.alignment import Registration
 from octoseg_ti.errors import MissingPackageError
-from octoseg_ti.types import Registration
 
 _MOST = 100_000
 """Points of a view that take part at most; more are thinned evenly."""

@@ -210,7 +210,7 @@ def fit_sets(
         fits = fit_all(
             samples.point[index], samples.normal[index], None, start, noise=noise, robust=robust
         )
-        chosen = choose(fits, noise=noise, room=_FIT, signed=samples.signed, spread=False)
+        chosen = choose(fits, noise=noise, room=_FIT, signed=samples.signed)
         kind[curved], parameters[curved] = chosen.kind, chosen.parameters
     fitted = np.flatnonzero((kind >= 0) & (kind < KINDS))
     return fitted, Surfaces(kind=kind[fitted], parameters=parameters[fitted])

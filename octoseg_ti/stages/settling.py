@@ -1,10 +1,14 @@
 """Where two surfaces fit a point about as well, what lies around it tells which one it is on.
 
-Next to a shallow edge, and where surfaces touch without one, two surfaces are nearer to each other
-than the noise, and points that choose for themselves are mixed. The evidence of a point is how much
-more the other surface costs; added up around a point, capped so that what lies beyond doubt on one
-side does not outweigh the other, it has its zero on the edge: on either side of a line the mean
-cost of the wrong surface is the higher one.
+Next to an edge, and where surfaces touch without one, two surfaces are nearer to each other than
+the noise, and points that choose for themselves are mixed. Two ways tell them apart:
+
+- Surfaces that cross: on the part's side of the edge each is in front of the other, or each behind,
+  as the points of both around there tell. A point is on the one that it is farther along towards:
+  the error of its height changes both distances alike, and has no say.
+- Surfaces that touch: the evidence of a point is how much more the other surface costs. Added up
+  around a point, capped so that what is beyond doubt on one side does not outweigh the other, it
+  has its zero where they touch: on either side the mean cost of the wrong one is higher.
 """
 
 from typing import Any
@@ -12,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from octoseg_ti.device import runtime
-from octoseg_ti.device.linalg import row
+from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F32Rows, F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.surfaces import surface_in_row
 from octoseg_ti.stages.leaves import Leaves
@@ -27,7 +31,7 @@ _PLANE = int(SurfaceKind.PLANE)
 
 
 @ti.func
-def box_gap(box_in: ti.template(), c: ti.i32, p: ti.template()) -> ti.f64:
+def _box_gap(box_in: ti.template(), c: ti.i32, p: vec3) -> ti.f64:
     """Return the squared distance from a place to the box of leaf c."""
     gap = 0.0
     for k in ti.static(range(3)):
@@ -37,7 +41,7 @@ def box_gap(box_in: ti.template(), c: ti.i32, p: ti.template()) -> ti.f64:
 
 
 @ti.func
-def _evidence(
+def _lead(
     label_in: ti.template(), second_in: ti.template(), off_in: ti.template(),
     a: ti.i32, b: ti.i32, j: ti.i32,
 ):  # fmt: skip
@@ -45,6 +49,32 @@ def _evidence(
     other = ti.select(label_in[j] == a, b, a)
     lead = ti.select(second_in[j] == other, ti.min(ti.cast(off_in[j, 2], ti.f64), DOUBT), DOUBT)
     return ti.select(label_in[j] == a, lead, -lead)
+
+
+@ti.func
+def _ask(
+    leaf: ti.template(), surface_in: ti.template(), label_in: ti.template(),
+    second_in: ti.template(), off_in: ti.template(), point_in: ti.template(),
+    p: vec3, a: ti.i32, b: ti.i32, reach: ti.f64,
+) -> vec3:  # fmt: skip
+    """Ask the points of a leaf, the nearer the more.
+
+    Returns how much they lead for surface a, and where those of each lie about the other.
+    """
+    total, ahead_a, ahead_b = 0.0, 0.0, 0.0
+    for j in range(leaf[0], leaf[1]):
+        if label_in[j] == a or label_in[j] == b:
+            q = row(point_in, j)
+            weight = 1.0 - (q - p).norm_sqr() / (reach * reach)
+            if weight > 0.0:
+                total += weight * _lead(label_in, second_in, off_in, a, b, j)
+                of = ti.select(label_in[j] == a, b, a)
+                h, _ = surface_in_row(surface_in, of, ti.cast(surface_in[of, 8], ti.i32), q)
+                if label_in[j] == a:
+                    ahead_a += weight * h
+                else:
+                    ahead_b += weight * h
+    return vec3(total, ahead_a, ahead_b)
 
 
 @ti.kernel
@@ -66,45 +96,29 @@ def _settle(
     """Let the points around every point in doubt decide."""
     for c in range(box_in.shape[0]):
         for i in range(link_in[c, 0], link_in[c, 1]):
-            a = label_in[i]
-            b = second_in[i]
+            a, b = label_in[i], second_in[i]
             label_out[i] = a
             if a >= 0 and b >= 0 and off_in[i, 0] <= farthest:
                 p = row(point_in, i)
                 f, n = surface_in_row(surface_in, a, ti.cast(surface_in[a, 8], ti.i32), p)
                 g, m = surface_in_row(surface_in, b, ti.cast(surface_in[b, 8], ti.i32), p)
-                crossing = surface_in[a, 8] == _PLANE and surface_in[b, 8] == _PLANE
-                if n.cross(m).norm() > _ACROSS:
-                    crossing = True
+                flat = surface_in[a, 8] == _PLANE and surface_in[b, 8] == _PLANE
+                crossing = flat or n.cross(m).norm() > _ACROSS
                 if crossing or off_in[i, 2] < DOUBT:
-                    total = 0.0
-                    # Where the points of each lie about the other.
-                    ahead = ti.Vector([0.0, 0.0])
+                    told = vec3(0.0, 0.0, 0.0)
                     for k in range(link_in[c, 2] - 1, link_in[c, 3]):
                         d = c
                         if k >= link_in[c, 2]:
                             d = neighbor_in[k]
-                        if box_gap(box_in, d, p) < reach * reach:
-                            for j in range(link_in[d, 0], link_in[d, 1]):
-                                if label_in[j] == a or label_in[j] == b:
-                                    q = row(point_in, j)
-                                    near = 1.0 - (q - p).norm_sqr() / (reach * reach)
-                                    if near > 0.0:
-                                        total += near * _evidence(
-                                            label_in, second_in, off_in, a, b, j
-                                        )
-                                        if crossing:
-                                            of = ti.select(label_in[j] == a, b, a)
-                                            h, _ = surface_in_row(
-                                                surface_in, of, ti.cast(surface_in[of, 8], ti.i32), q
-                                            )
-                                            if label_in[j] == a:
-                                                ahead[0] += near * h
-                                            else:
-                                                ahead[1] += near * h
-                    if crossing and ahead[0] * ahead[1] != 0.0:
-                        total = ti.math.sign(ahead[0]) * g - ti.math.sign(ahead[1]) * f
-                    if total < 0.0:
+                        if _box_gap(box_in, d, p) < reach * reach:
+                            leaf = ti.Vector([link_in[d, 0], link_in[d, 1]])
+                            told += _ask(
+                                leaf, surface_in, label_in, second_in, off_in, point_in,
+                                p, a, b, reach,
+                            )  # fmt: skip
+                    if crossing and told[1] * told[2] != 0.0:
+                        told[0] = ti.math.sign(told[1]) * g - ti.math.sign(told[2]) * f
+                    if told[0] < 0.0:
                         label_out[i] = b
 
 

@@ -301,6 +301,7 @@ def _boxes(
 def _log_surfaces(rec: Any, result: Segmentation, shift: np.ndarray, static: bool) -> None:
     import rerun as rr
 
+    deviation = result.deviation
     for k in range(result.patch_count):
         mesh = patch_mesh(result, k)
         if mesh is None:
@@ -317,6 +318,7 @@ def _log_surfaces(rec: Any, result: Segmentation, shift: np.ndarray, static: boo
             rr.AnyValues(
                 kind=kind,
                 parameters=result.parameters[k],
+                deviations=deviation[k],
                 rms_mm=float(result.residual[k]),
                 surface=int(result.surface[k]),
             ),

@@ -20,11 +20,13 @@ from typing import Any
 
 import numpy as np
 
+from octoseg_ti.alignment import Registration
 from octoseg_ti.errors import DataError
 from octoseg_ti.evaluation import Scores
-from octoseg_ti.types import Registration, Segmentation, StopReason, SurfaceKind, Truth
+from octoseg_ti.types import Segmentation, StopReason, SurfaceKind, Truth
 from octoseg_ti.view.scene import finite_rows
 from octoseg_ti.view.stream import replaced
+from octoseg_ti.view.surface_text import surface_text
 
 _PACKAGES = ("taichi", "numpy", "scipy", "rerun-sdk", "mcap", "pillow")
 
@@ -175,7 +177,7 @@ def _grid(result: Segmentation) -> Section:
 
 def _patches(result: Segmentation) -> Section:
     rows = []
-    sizes = result.patch_sizes
+    sizes, deviation = result.patch_sizes, result.deviation
     for k in range(result.patch_count):
         kind = SurfaceKind(int(result.kind[k]))
         rms = result.residual[k]
@@ -186,11 +188,17 @@ def _patches(result: Segmentation) -> Section:
                 str(int(result.surface[k])),
                 f"{sizes[k]:,}",
                 "-" if np.isnan(rms) else f"{rms:.4f}",
-                _surface_text(kind, result.parameters[k]),
+                surface_text(kind, result.parameters[k], deviation[k]),
             )
         )
     head = ("patch", "kind", "surface", "points", "rms [mm]", "fitted")
-    return Section(title=f"{result.patch_count} patches", head=head, rows=rows)
+    title = f"{result.patch_count} patches"
+    text = (
+        "Standard deviations (±) are those of the fit, for independent errors of the points; what "
+        "stripes and views share is not in them."
+    )
+    shown = [text] if np.isfinite(deviation[:, 6:]).any() else []
+    return Section(title=title, paragraphs=shown, head=head, rows=rows)
 
 
 def _fillets(result: Segmentation) -> Section | None:
@@ -213,24 +221,6 @@ def _fillets(result: Segmentation) -> Section | None:
     text = "Rounds that a ball leaves that touches two patches; strips are patches on such a round."
     title = f"{len(found)} fillets"
     return Section(title=title, paragraphs=[text], head=head, rows=rows)
-
-
-def _surface_text(kind: SurfaceKind, parameters: np.ndarray) -> str:
-    """Say in words what the parameters of a surface mean."""
-    point, axis, a, b = parameters[:3], parameters[3:6], parameters[6], parameters[7]
-    texts = {
-        SurfaceKind.PLANE: f"normal {_vector(axis)}",
-        SurfaceKind.CYLINDER: f"radius {a:.3f} mm, axis {_vector(axis)}",
-        SurfaceKind.CONE: f"half angle {math.degrees(a):.2f} deg, axis {_vector(axis)}",
-        SurfaceKind.SPHERE: f"radius {a:.3f} mm, center {_vector(point)} mm",
-        SurfaceKind.TORUS: f"radii {a:.3f} and {b:.3f} mm, axis {_vector(axis)}",
-    }
-    text = texts.get(kind, "-")
-    return "-" if "nan" in text else text
-
-
-def _vector(values: np.ndarray) -> str:
-    return "(" + ", ".join(f"{v:.3f}" for v in values) + ")"
 
 
 def _scores(scores: Scores) -> list[Section]:

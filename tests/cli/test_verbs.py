@@ -54,6 +54,9 @@ def test_segment_json_is_json(octoseg, recording: Path, tmp_path: Path) -> None:
     outcome = octoseg("segment", recording, "-o", tmp_path / "a.npz", "--json", "--quiet")
     figures = json.loads(outcome.out)
     assert figures["patches"] == len(figures["patch_table"]) == 2
+    for patch in figures["patch_table"]:
+        for name in ("parameters", "deviations"):
+            assert [value is not None for value in patch[name]] == 6 * [True] + 2 * [False]
     assert figures["params"]["grid"]["tolerance"] > 0, "chosen values are reported"
     assert figures["seconds"]
     assert figures["outputs"] == [str(tmp_path / "a.npz")]

@@ -104,6 +104,10 @@ def make_result(scans: Scans, truth: Truth, *, cells: int = 200, seed: int = 0) 
     labels = truth.patch.copy()
     parameters = rng.standard_normal((patches, 8))
     parameters[:, 7] = np.nan
+    root = 1e-3 * rng.standard_normal((patches, 8, 3))
+    covariance = np.einsum("kim,kjm->kij", root, root)
+    covariance[::3] = np.nan
+    covariance[:, 7] = covariance[:, :, 7] = np.nan
     assert truth.normal is not None
     normals = truth.normal.astype(np.float32)
     normals[::17] = 0.0
@@ -141,6 +145,7 @@ def make_result(scans: Scans, truth: Truth, *, cells: int = 200, seed: int = 0) 
         kind=rng.integers(-1, 6, patches).astype(np.int8),
         surface=rng.integers(0, patches, patches).astype(np.int32),
         parameters=parameters,
+        covariance=covariance,
         residual=rng.random(patches),
         cells=grid,
         fillets=fillets,

@@ -75,6 +75,24 @@ def test_faults_are_found(tmp_path):
     assert len(check(path)) == 1 and "NPZ" in check(path)[0]
 
 
+def test_faults_of_results_are_found(tmp_path):
+    scans, truth = make()
+    result = make_result(scans, truth)
+    path = tmp_path / "f.npz"
+    write(path, result)
+    assert check(path) == []
+    assert 0 < describe(path)["covariances"] < result.patch_count
+    bad = np.zeros((4, 8, 8))
+    bad[0, 0, 0] = -1.0
+    bad[1, 0, 1] = 1.0
+    bad[2, [0, 1], [1, 0]] = 2.0
+    bad[2, [0, 1], [0, 1]] = 1.0
+    bad[3, 2, 2] = np.inf
+    covariance = np.concatenate([bad, result.covariance[4:]])
+    write(path, dataclasses.replace(result, covariance=covariance))
+    assert check(path) == ["4 covariances of the result are none of any parameters"]
+
+
 def test_faults_of_messages_are_found(tmp_path):
     from octoseg_ti.files import messages
 

@@ -47,7 +47,38 @@ def test_npz_brings_everything_back(tmp_path):
     wanted = {"normals": ("float32", 2), "labels": ("int32", 1), "edge": ("uint8", 1)}
     wanted |= {"level": ("int8", 1), "outlier": ("uint8", 1), "kind": ("int8", 1)}
     wanted |= {"points": ("float64", 2), "surface": ("int32", 1), "parameters": ("float64", 2)}
+    wanted["covariance"] = ("float64", 3)
     assert wanted.items() <= kinds.items()
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    hnp.arrays(
+        np.float64, (4, 8, 8), elements=st.floats(allow_nan=True, allow_infinity=True, width=64)
+    ),
+    st.sampled_from([".npz", ".mcap"]),
+)
+def test_any_covariance_comes_back(tmp_path_factory, covariance, suffix):
+    scans, truth = make(4, 9)
+    result = make_result(scans, dataclasses.replace(truth, patch=truth.patch % 4), cells=5)
+    path = tmp_path_factory.mktemp("covariance") / f"r{suffix}"
+    write(path, dataclasses.replace(result, covariance=covariance), scans=scans)
+    np.testing.assert_array_equal(read_segmentation(path).covariance, covariance)
+
+
+def test_results_of_earlier_versions_have_no_covariance(tmp_path):
+    result = make_result(*make())
+    write(tmp_path / "r.npz", result)
+    with np.load(tmp_path / "r.npz") as archive:
+        arrays = {name: archive[name] for name in archive.files if name != "covariance"}
+    np.savez(tmp_path / "old.npz", **arrays)
+    back = read_segmentation(tmp_path / "old.npz")
+    assert_equal(back, result, but=("covariance",))
+    assert back.covariance.shape == (result.patch_count, 8, 8) and np.isnan(back.covariance).all()
+    for wrong in (result.covariance[:, :7], result.covariance[1:]):
+        np.savez(tmp_path / "wrong.npz", covariance=wrong, **arrays)
+        with pytest.raises(DataError, match="covariance has"):
+            read_segmentation(tmp_path / "wrong.npz")
 
 
 def test_npz_without_truth_has_none(tmp_path):
@@ -149,7 +180,11 @@ def test_ply_output_has_colours_by_label_and_patches(tmp_path):
     for name in ("label", "edge", "level", "outlier"):
         expected = result.labels if name == "label" else getattr(result, name)
         np.testing.assert_array_equal(vertex[name], expected)
-    np.testing.assert_array_equal(content["patch"]["a"], result.parameters[:, 6])
+    patch = content["patch"]
+    np.testing.assert_array_equal(patch["a"], result.parameters[:, 6])
+    np.testing.assert_array_equal(patch["cov_px_py"], result.covariance[:, 0, 1])
+    np.testing.assert_array_equal(patch["cov_az_a"], result.covariance[:, 5, 6])
+    assert sum(name.startswith("cov_") for name in patch.data.dtype.names) == 36
 
 
 @pytest.mark.parametrize("text", [True, False])

@@ -1,8 +1,9 @@
-"""The unknowns of the fit move surfaces as their derivatives say, on the device and on the host."""
+"""The unknowns of the fit move surfaces as their derivatives say."""
 
 import numpy as np
 import pytest
 from reference.clouds import rotation
+from reference.motions import moved
 from reference.surfaces import CONE, PLANE, SPHERE, TORUS, distance_of
 
 from octoseg_ti.device import runtime
@@ -16,7 +17,6 @@ from octoseg_ti.fitting.motions import (
     anchor_radius,
     change_of_distance,
     is_free,
-    moved,
     step_state,
     vec7,
 )
@@ -92,7 +92,7 @@ def run(kind: int, state: np.ndarray, points: np.ndarray, step: np.ndarray) -> t
 
 
 def shifted(state: np.ndarray, kind: int, step: np.ndarray) -> np.ndarray:
-    """Return the state after a step by the host's `moved`."""
+    """Return the state after a step by the reference."""
     states, steps = np.zeros((1, KINDS, STATE)), np.zeros((1, KINDS, UNKNOWNS))
     states[..., 3:6], states[..., 6:9] = [0, 0, 1], [1, 0, 0]
     states[..., 9] = 1.0
@@ -127,7 +127,7 @@ def test_derivatives_are_those_of_the_motion(kind: int, seed: int) -> None:
 
 
 @pytest.mark.parametrize("kind", range(KINDS))
-def test_device_and_host_step_alike(kind: int) -> None:
+def test_steps_are_those_of_the_reference(kind: int) -> None:
     for seed in range(5):
         rng = np.random.default_rng(seed)
         state = random_state(kind, rng)

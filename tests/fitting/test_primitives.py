@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from reference.clouds import rotation
-from reference.surfaces import CONE, CYLINDER, PLANE, SPHERE, TORUS, distance_of, patch_of, placed
+from reference.surfaces import CYLINDER, PLANE, SPHERE, TORUS, distance_of, patch_of, placed
 from scipy.optimize import least_squares
 
 from octoseg_ti.device.surfaces import KINDS
-from octoseg_ti.fitting.primitives import FREEDOM, Fits, covariance, fit_all
+from octoseg_ti.fitting.primitives import FREEDOM, Fits, fit_all
 
 
 def measured(
@@ -168,27 +168,3 @@ def test_degenerate_groups_end_well(robust: bool) -> None:
 def test_no_groups() -> None:
     fits = fit([])
     assert fits.parameters.shape == (0, KINDS, 8)
-
-
-@pytest.mark.parametrize("kind", range(KINDS))
-def test_the_covariance_is_the_scatter_of_the_parameters(kind: int) -> None:
-    rng = np.random.default_rng(kind)
-    points, normals, _ = patch_of(kind, rng, 200)
-    groups = [
-        (points + 0.01 * rng.standard_normal((200, 1)) * normals, normals) for _ in range(200)
-    ]
-    fits = fit(groups)
-    found = covariance(fits, np.full(200, kind))
-    parameters = np.nan_to_num(fits.parameters[:, kind])
-    parameters[:, 3:6] *= np.sign(parameters[:, 3:6] @ [[0.0], [0.0], [1.0]])
-    shape = {PLANE: [], TORUS: [6, 7]}.get(kind, [6])
-    columns = [3, 4, *shape] if kind != SPHERE else [0, 1, 2, 6]
-    if kind in (CONE, TORUS):
-        columns += [0, 1, 2]
-    scatter = np.cov(parameters[:, columns].T)
-    expected = found.mean(axis=0)[np.ix_(columns, columns)]
-    np.testing.assert_allclose(np.diag(expected), np.diag(scatter), rtol=0.4)
-    size = np.sqrt(np.diag(scatter))
-    np.testing.assert_allclose(
-        expected / np.outer(size, size), scatter / np.outer(size, size), atol=0.35
-    )

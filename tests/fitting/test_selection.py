@@ -5,6 +5,7 @@ import pytest
 from reference.clouds import rotation
 from reference.surfaces import CONE, CYLINDER, PLANE, SPHERE, TORUS, patch_of, placed
 
+from octoseg_ti.fitting.covariance import covariances
 from octoseg_ti.fitting.primitives import fit_all
 from octoseg_ti.fitting.selection import Choice, choose
 from octoseg_ti.types import SurfaceKind
@@ -36,13 +37,16 @@ def test_every_kind_is_told(noise: float, over: float) -> None:
     for arc in (0.8, 1.5, 3.0, 6.28):
         cases = [(k, *measured(k, s, noise, arc=arc)) for k in range(5) for s in range(6)]
         answer = chosen([c[1:3] for c in cases], over * noise)
+        start = np.cumsum([0] + [len(c[1]) for c in cases])
+        points = np.concatenate([c[1] for c in cases])
+        spread = covariances(points, start, answer.kind, answer.parameters)
         np.testing.assert_array_equal(answer.kind, [c[0] for c in cases], err_msg=f"arc {arc}")
         assert np.all(answer.evidence > 0)
         for g, (kind, _, _, true) in enumerate(cases):
             if kind == PLANE:
                 assert np.isnan(answer.parameters[g, 6])
                 continue
-            deviation = np.sqrt(answer.covariance[g, 6, 6])
+            deviation = np.sqrt(spread[g, 6, 6])
             # Four standard deviations; half a percent of 72 would be beyond three.
             assert abs(answer.parameters[g, 6] - true[6]) < 4.5 * deviation + 1e-6
             assert answer.side[g] == 1.0
@@ -79,7 +83,7 @@ def test_what_fits_nothing_is_a_free_form_and_few_points_are_nothing() -> None:
     up = np.tile([0.0, 0.0, 1.0], (500, 1))
     answer = chosen([(wavy, up), (flat[:3] @ np.eye(2, 3), up[:3])], 0.02)
     assert answer.kind.tolist() == [SurfaceKind.FREE_FORM, SurfaceKind.NONE]
-    assert np.isnan(answer.parameters).all() and np.isnan(answer.covariance).all()
+    assert np.isnan(answer.parameters).all()
     assert answer.rms[0] > 0.1 and np.isnan(answer.rms[1])
     assert answer.side.tolist() == [0.0, 0.0]
 
@@ -98,18 +102,6 @@ def test_both_sides_of_a_sheet_are_no_plane() -> None:
     fits = fit_all(points, normals, None, np.array([0, 400]))
     assert choose(fits, noise=0.02).kind[0] == SurfaceKind.FREE_FORM
     assert choose(fits, noise=0.02, signed=False).kind[0] == PLANE
-
-
-def test_covariances_are_made_where_asked_for() -> None:
-    flat = np.random.default_rng(1).uniform(-10, 10, (200, 2))
-    points = np.column_stack((flat, 0.01 * flat[:, 0]))
-    up = np.tile([0.0, 0.0, 1.0], (200, 1))
-    fits = fit_all(points, up, None, np.array([0, 200], np.int32), noise=0.02)
-    with_them, without = choose(fits, noise=0.02), choose(fits, noise=0.02, spread=False)
-    assert np.isfinite(with_them.covariance[0, :3, :3]).all()
-    assert np.isnan(without.covariance).all()
-    np.testing.assert_array_equal(with_them.parameters, without.parameters)
-    assert with_them.kind[0] == without.kind[0] == PLANE
 
 
 def test_points_of_the_neighbour_do_not_change_the_kind() -> None:

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 from reference.clouds import random_cloud, rotation
+from reference.covariances import covariance_of, squared_error
 from reference.patches import plane_of
+from reference.surfaces import PLANE
 
 from octoseg_ti.device import runtime
 from octoseg_ti.stages.grid import Grid, build_grid
@@ -37,7 +39,7 @@ def test_equals_the_reference(seed: int, n: int) -> None:
     of_leaf[rng.random(len(leaves)) < 0.1] = -1
     label = np.empty(n, np.int32)
     label[order] = np.repeat(of_leaf, grid.holds[leaves])
-    kind, parameters, residual = fit_planes(grid, leaves, of_leaf, 5, limit=0.1)
+    kind, parameters, covariance, residual = fit_planes(grid, leaves, of_leaf, 5, limit=0.1)
     half = grid.size / 2
     for k in range(5):
         what = f"seed {seed}, n {n}, patch {k}"
@@ -56,6 +58,7 @@ def test_equals_the_reference(seed: int, n: int) -> None:
             assert np.isnan(parameters[k, 6:]).all(), what
         else:
             assert np.isnan(parameters[k]).all() and np.isnan(residual[k]), what
+            assert np.isnan(covariance[k]).all(), what
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -67,12 +70,32 @@ def test_a_plane_is_found_to_its_noise(seed: int) -> None:
     grid = build_grid(points, np.tile(q[:, 2], (3000, 1)), tolerance=1.0, divisions=1)
     leaves = leaves_of(grid)
     label = np.zeros(len(leaves), np.int32)
-    kind, parameters, residual = fit_planes(grid, leaves, label, 1, limit=0.03)
+    kind, parameters, covariance, residual = fit_planes(grid, leaves, label, 1, limit=0.03)
     assert kind.tolist() == [SurfaceKind.PLANE]
     assert residual[0] == pytest.approx(0.02, rel=0.05)
     assert abs(parameters[0, 3:6] @ q[:, 2]) > 1 - 1e-8
     assert abs((parameters[0, :3] - [700.0, -200.0, 50.0]) @ q[:, 2]) < 2e-3
+    expected = covariance_of(points, PLANE, parameters[0])
+    np.testing.assert_allclose(covariance[0], expected, rtol=1e-3, atol=1e-5 * expected[0, 0])
+    true = np.array([700.0, -200.0, 50.0, *q[:, 2], np.nan, np.nan])
+    assert squared_error(PLANE, parameters[0], true, covariance[0]) < 3 * 16.0
     assert fit_planes(grid, leaves, label, 1, limit=0.01)[0].tolist() == [-1]
+
+
+def test_points_on_a_line_leave_a_plane_open() -> None:
+    rng = np.random.default_rng(0)
+    line = np.column_stack((np.linspace(0, 9, 200), 1e-2 * rng.standard_normal((200, 2))))
+    deviations = []
+    for points in (line, line[:3]):
+        normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+        grid = build_grid(points, normals, tolerance=1.0, min_cell=20.0)
+        leaves = leaves_of(grid)
+        label = np.zeros(len(leaves), np.int32)
+        kind, _, covariance, _ = fit_planes(grid, leaves, label, 1, limit=1.0)
+        assert kind.tolist() == [SurfaceKind.PLANE]
+        deviations.append(np.sqrt(np.diag(covariance[0])))
+    assert deviations[0][3] < 1e-3 and 0.03 < np.linalg.norm(deviations[0][4:6]) < 0.2
+    assert np.isnan(deviations[1]).all()  # three points are on a plane anyway
 
 
 def test_no_patches() -> None:
@@ -80,8 +103,8 @@ def test_no_patches() -> None:
     grid = build_grid(points, normals, tolerance=1.0, divisions=1)
     leaves = leaves_of(grid)
     label = np.full(len(leaves), -1, np.int32)
-    kind, parameters, residual = fit_planes(grid, leaves, label, 0, limit=1.0)
-    assert (kind.shape, parameters.shape, residual.shape) == ((0,), (0, 8), (0,))
+    found = fit_planes(grid, leaves, label, 0, limit=1.0)
+    assert [array.shape for array in found] == [(0,), (0, 8), (0, 8, 8), (0,)]
 
 
 def test_permuting_the_points_changes_no_bit() -> None:

@@ -127,10 +127,13 @@ def segmentation(scans, truth):
         parameters[k, 3:6] = truth.normal[on].mean(axis=0)
         if kind == SurfaceKind.SPHERE:
             parameters[k, :3], parameters[k, 6] = [*DOME, -np.sqrt(19)], 10.0
+    covariance = np.full((4, 8, 8), np.nan)
+    covariance[kinds == SurfaceKind.SPHERE, 6, 6] = 0.0123**2
     return Segmentation(
         points=scans.points, normals=normals, labels=labels, edge=edge.astype(np.uint8),
         level=level, outlier=outlier, kind=kinds, surface=np.arange(4, dtype=np.int32),
-        parameters=parameters, residual=np.array([0.001, 0.002, 0.0035, np.nan]), cells=cells,
+        parameters=parameters, covariance=covariance,
+        residual=np.array([0.001, 0.002, 0.0035, np.nan]), cells=cells,
         stripe=scans.stripe, view=scans.view,
         params=Params(grid=GridParams(tolerance=0.01, divisions=2, min_cell=1.0)),
         measured=Measurement(

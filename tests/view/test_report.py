@@ -63,7 +63,7 @@ def test_html_holds_the_numbers(made):
     assert rows["part"] == ["plate"]
     spheres = [row for row in page.rows if len(row) == 6 and row[1] == "sphere"]
     assert spheres[0][3:5] == [f"{result.patch_sizes[2]:,}", "0.0035"]
-    assert spheres[0][5].startswith("radius 10.000 mm")
+    assert spheres[0][5].startswith("radius 10.000 ± 0.012 mm")
     assert len(page.images) == 9
     assert all(i["src"].startswith("data:image/png;base64,iVBOR") for i in page.images)
 
@@ -124,8 +124,8 @@ def test_an_empty_result(made):
     result = made[2]
     none = dataclasses.replace(
         result, labels=np.full(len(result), -1, np.int32), kind=np.zeros(0, np.int8),
-        surface=np.zeros(0, np.int32), parameters=np.zeros((0, 8)), residual=np.zeros(0),
-        seconds={},
+        surface=np.zeros(0, np.int32), parameters=np.zeros((0, 8)),
+        covariance=np.zeros((0, 8, 8)), residual=np.zeros(0), seconds={},
     )  # fmt: skip
     text = report.markdown(none)
     assert "0 patches" in text and "0.0% of the points" in text
