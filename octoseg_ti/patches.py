@@ -9,10 +9,11 @@ import numpy as np
 
 from octoseg_ti.arrange import Arranged
 from octoseg_ti.borders.tracing import Borders
-from octoseg_ti.defaults import spacing_of
+from octoseg_ti.defaults import PIECE_GAPS, spacing_of
 from octoseg_ti.device import runtime
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.params import Params
+from octoseg_ti.readmission import readmit
 from octoseg_ti.stages.adjacency import Adjacency, find_touching
 from octoseg_ti.stages.assignment import (
     assign_points,
@@ -190,22 +191,26 @@ def assemble(
     """Number the patches by size, describe their surfaces, and bring all into the input order."""
     node = runtime.download(grid.node)[: grid.count]
     patches = found.count
-    size = np.bincount(found.label[found.label >= 0], minlength=patches)
-    rank = np.argsort(-size, kind="stable")
-    name = np.full(patches + 1, NONE, np.int32)
-    name[rank] = np.arange(patches, dtype=np.int32)
-    kind, parameters, covariance, residual, surface = _describe(grid, leaves, found, measured)
     n = len(scans)
     outlier = np.zeros(n, np.uint8)
     if not arranged.whole:
         outlier[:] = 1
         outlier[arranged.row] = 0
     left_out = np.flatnonzero(outlier)
+    outside = scans_in_world(scans, left_out)
+    back = _come_back(outside, grid, found, params)
+    size = np.bincount(found.label[found.label >= 0], minlength=patches)
+    size += np.bincount(back[back >= 0], minlength=patches)
+    rank = np.argsort(-size, kind="stable")
+    name = np.full(patches + 1, NONE, np.int32)
+    name[rank] = np.arange(patches, dtype=np.int32)
+    kind, parameters, covariance, residual, surface = _describe(grid, leaves, found, measured)
     rows = to_rows(
         grid, leaves, found.edge, found.label, name[:patches], point, normal, arranged.row,
         left_out,
     )  # fmt: skip
-    rows.points[left_out] = scans_in_world(scans, left_out)
+    rows.points[left_out], rows.labels[left_out] = outside, name[back]
+    outlier[left_out[back >= 0]] = 0
     mean = runtime.download(grid.mean)[leaves]
     cells = Cells(
         corner=grid.corner + node[leaves, X : Z + 1] * grid.edge_length[leaves, None],
@@ -232,6 +237,18 @@ def assemble(
         covariance=covariance[rank], residual=residual[rank],
         cells=cells, stripe=scans.stripe, view=scans.view, params=params, measured=measured,
         passes=grid.passes, name=scans.name,
+    )  # fmt: skip
+
+
+def _come_back(outside: np.ndarray, grid: Grid, found: Regions, params: Params) -> np.ndarray:
+    """Return the region of every point that cleaning left out, -1 = it stays out, i32."""
+    noise, gap = params.surfaces.noise, params.normals.gap
+    if not len(outside) or found.surface is None or noise is None or gap is None:
+        return np.full(len(outside), NONE, np.int32)
+    assert found.kind is not None and found.parameters is not None
+    return readmit(
+        outside - grid.corner, runtime.download(grid.point), found.label, found.surface,
+        found.kind, found.parameters, noise=noise, gap=PIECE_GAPS * gap,
     )  # fmt: skip
 
 

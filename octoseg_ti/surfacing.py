@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from octoseg_ti.defaults import PIECE_GAPS
 from octoseg_ti.device import runtime
 from octoseg_ti.params import Params
 from octoseg_ti.patches import Regions
@@ -21,8 +22,6 @@ from octoseg_ti.types import NONE
 # Positions are exact, and tell by themselves, where a surface needs no more than this share of the
 # points of a patch.
 _ALONE = 0.33
-# Points of one piece of a surface are linked over so many times the longest distance of neighbours.
-_GAPS = 2.0
 # Distances beyond this many noises count as this many; whole units add up alike in any order.
 _CAP, _UNIT = 4.0, 1024.0
 # A point that fits nothing joins a patch within so many times the usual reach.
@@ -53,7 +52,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         Tolerance(noise, turn, fewest, exact), rule, narrow=exact,
     )  # fmt: skip
     gap = params.normals.gap
-    near = graph if gap is None else without_gaps(grid, graph, _GAPS * gap)
+    near = graph if gap is None else without_gaps(grid, graph, PIECE_GAPS * gap)
     label, surface = number_pieces(near, surfaced, least, fewest)
     label, surface, free = _with_free_forms(label, surface, found, least)
     if len(surface):

@@ -19,8 +19,6 @@ from octoseg_ti.stages.support import find_support
 _STEP = 1.5  # neighbours farther apart than this many spacings may stand on both sides of a step
 _SHORT = 16  # a piece of a stripe with fewer points is in doubt
 _BACKING = 0.15  # share of a full surface around it that holds a point
-# With fewer neighbours than this share of a full surface a point is asked again, so much farther.
-_SPARSE, _WIDER = 0.4, 2.0
 _KINK, _BREAK = 1, 2
 
 
@@ -139,19 +137,11 @@ def mark_outliers(
     if poses is None:
         poses = np.tile(np.eye(4), (int(view.max()) + 1, 1, 1))
     # Neighbours on a full surface count from 1 in the middle to 0 at the rim: a third of all.
-    full = np.pi * isolation**2 / (along * across)
-    backing = _BACKING * full / 3.0
-    true, count = find_support(
+    full = np.pi * isolation**2 / (along * across) / 3.0
+    true = find_support(
         points, view, poses, doubtful,
-        radius=isolation, off=spike, backing=backing, detached=detached,
+        radius=isolation, off=spike, backing=_BACKING * full, detached=detached,
     )  # fmt: skip
-    # A surface seen at a grazing angle has few points: its neighbours are farther off.
-    sparse = np.flatnonzero(~true & (count < _SPARSE * full))
-    if len(sparse):
-        true[sparse], _ = find_support(
-            points, view, poses, doubtful[sparse],
-            radius=_WIDER * isolation, off=spike, backing=_SPARSE * backing, detached=detached,
-        )  # fmt: skip
     out = doubtful[~true]
     if 2 * len(out) <= len(points):
         marked[out] = 1

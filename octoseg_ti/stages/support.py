@@ -380,7 +380,7 @@ def find_support(
     off: float,
     backing: float,
     detached: int,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> np.ndarray:
     """Say which doubtful points lie on a surface that is more than a small detached group.
 
     Args:
@@ -394,8 +394,7 @@ def find_support(
         detached: Points of a group that is a surface without other points to hold it.
 
     Returns:
-        True for a point that does, shape (S,), bool; and how many neighbours its own view has for
-        it, up to 24, shape (S,).
+        True for a point that does, shape (S,), bool.
     """
     runtime.ensure_started()
     chosen = len(doubtful)
@@ -427,14 +426,13 @@ def find_support(
     _name_groups(parent, root)
     # Other views are asked where the own one leaves the matter open.
     own, group = runtime.download(verdict), runtime.download(root)
-    count = np.count_nonzero(runtime.download(near) >= 0, axis=1)
     asking = np.flatnonzero((own == 0) | ~large_or_held(own, group, detached)[group])
     if len(asking):
         shared = (at, place, who, key, first, near, far, verdict)
         rule = (radius, off, backing)
         _ask_others(len(poses), rule, runtime.upload(asking.astype(np.int32)), *shared)
     answer = runtime.download(verdict)
-    return (answer > 0) & large_or_held(answer, group, detached)[group], count
+    return (answer > 0) & large_or_held(answer, group, detached)[group]
 
 
 def large_or_held(verdict: np.ndarray, group: np.ndarray, detached: int) -> np.ndarray:
