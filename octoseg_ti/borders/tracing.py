@@ -34,12 +34,13 @@ from octoseg_ti.borders.rims import mark_rims
 from octoseg_ti.borders.zones import CAP, EDGE, Search, Zones, find_zones, ranges
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.stages.marking import nearest_marked
-from octoseg_ti.stages.profiles import BALL
+from octoseg_ti.stages.profiles import BALL, FIRST, SECOND
 from octoseg_ti.stages.rims import Lines
 from octoseg_ti.types import NONE, EdgeClass
 
 # Rounds of claims; between them surfaces are fitted anew without what was claimed.
 _ROUNDS = 2
+_GIVEN = 0.15  # share of the points of a strip that its sides may get back, at most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,7 +89,7 @@ def find_borders(search: Search, lines: Lines | None = None) -> Borders:
         mark_rims(search, lines, edge)
     sides = zones.pairs[fillets].astype(np.int32)
     return Borders(
-        label=give_back(search, strip, sides),
+        label=give_back(search, strip, sides, fit.radius[fillets]),
         edge=edge,
         fillet=number[search.claim],
         sides=sides,
@@ -98,33 +99,46 @@ def find_borders(search: Search, lines: Lines | None = None) -> Borders:
     )
 
 
-def give_back(search: Search, strip: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Return the patch of every point, those of strips that lie on a side as well given to that.
+def give_back(
+    search: Search, strip: np.ndarray, sides: np.ndarray, radius: np.ndarray
+) -> np.ndarray:
+    """Return the patch of every point, those of strips that lie on a side given to that.
 
-    Next to the line of contact nothing tells the strip from the side, up to where the strip has
-    left it by twice the noise: there the side goes on, as a face is what a part is measured by.
+    The line of contact follows from both sides and the radius, more exactly than single points can
+    tell. Next to it, up to where the strip has left the side by twice the noise, the side goes on,
+    as a face is what a part is measured by; but the strip stays a patch.
+
+    Args:
+        search: What is known.
+        strip: Fillet that every patch is a strip of, -1 = none, shape (K,).
+        sides: The two patches that every fillet touches, shape (F, 2).
+        radius: Its radius [mm], above 0 = concave, shape (F,).
     """
-    label = search.label
+    label = search.label.copy()
     mine = np.flatnonzero(np.append(strip, NONE)[label] >= 0)
     mine = mine[search.analytic[label[mine]]]
-    point, own = search.points[mine], label[mine]
+    fillet = strip[label[mine]]
+    at = search.place(sides, radius, mine, fillet)
+    for region, side in ((FIRST, 0), (SECOND, 1)):
+        beyond = at.region == region
+        label[mine[beyond]] = sides[fillet[beyond], side]
+    mine, fillet = mine[at.region == BALL], fillet[at.region == BALL]
+    own = label[mine]
     # Where the point is on the strip: its own error has no say.
     kind, parameters = search.given[:, 8].astype(np.int32), search.given[:, :8]
-    far, outward = evaluate_surfaces(point, own, kind, parameters)
-    foot = point - far[:, None] * outward
-    both = sides[strip[own]]
+    far, outward = evaluate_surfaces(search.points[mine], own, kind, parameters)
+    foot = search.points[mine] - far[:, None] * outward
     kind, parameters = search.table[:, 8].astype(np.int32), search.table[:, :8]
     gap = np.stack(
-        [np.abs(evaluate_surfaces(foot, both[:, k], kind, parameters)[0]) for k in range(2)], axis=1
+        [np.abs(evaluate_surfaces(foot, sides[fillet, k], kind, parameters)[0]) for k in range(2)],
+        axis=1,
     )
     nearer, least = gap.argmin(axis=1), gap.min(axis=1)
-    # Of a narrow strip the middle stays.
     reach = np.full(search.count, WEAK * search.noise)
     for patch in np.unique(own):
-        reach[patch] = min(reach[patch], np.median(least[own == patch]))
+        reach[patch] = min(reach[patch], np.quantile(least[own == patch], _GIVEN))
     weak = least <= reach[own]
-    label = label.copy()
-    label[mine[weak]] = both[weak, nearer[weak]]
+    label[mine[weak]] = sides[fillet[weak], nearer[weak]]
     return label
 
 
