@@ -15,6 +15,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.fitting.covariance import covariances
+from octoseg_ti.fitting.refining import refine
 from octoseg_ti.stages.extraction import Tolerance, explain
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import (
@@ -62,7 +63,7 @@ _LEFT_POINTS, _LEFT_SHARE = 2, 3
 # Samples for fitting a surface anew.
 _REFIT = 300
 # ... and in the end, when it is settled which points are its own; of one leaf at most.
-_SETTLED, _DENSE = 1000, 32
+_SETTLED, _DENSE = 600, 32
 # ... away from other surfaces, if there are so many of these.
 _INNER = 40
 _MERGES = 8
@@ -186,7 +187,17 @@ class _Search:
             i if len(i) >= _INNER and 4 * len(i) >= len(m) else m
             for i, m in zip(inner, members, strict=True)
         ]
-        self.fit_to(self.samples, [spread(m, _REFIT) for m in members])
+        which = np.array([m for m, s in enumerate(members) if len(s) >= 10], np.int64)
+        sets = [spread(members[m], _REFIT) for m in which]
+        noise = self.tolerance.noise
+        fitted, fits = fit_sets(self.samples, sets, noise, robust=True)
+        new = lie_on(self.samples, sets, fitted, fits, 3.0 * noise, 0.5)
+        old = lie_on(self.samples, sets, fitted, self.surfaces.at(which[fitted]), 3.0 * noise, 0.5)
+        kind, parameters = self.surfaces.kind.copy(), self.surfaces.parameters.copy()
+        for k, f in enumerate(fitted):
+            if new[k].mean() >= old[k].mean() - 0.01:
+                kind[which[f]], parameters[which[f]] = fits.kind[k], fits.parameters[k]
+        self.surfaces = Surfaces(kind=kind, parameters=parameters)
 
     def refit_settled(self) -> np.ndarray:
         """Fit the surfaces to more of their points, up to the edges: these are settled now.
@@ -209,24 +220,13 @@ class _Search:
         both = joined_samples(self.samples, more)
         name = np.concatenate([np.where(few[of], NONE, of), label[more.index]])
         sets = [spread(m, _SETTLED) for m in members_of(name, count)]
-        self.fit_to(both, sets)
-        index = np.concatenate([np.zeros(0, np.int64), *sets])
-        start = np.cumsum([0] + [len(s) for s in sets])
-        return covariances(both.point[index], start, self.surfaces.kind, self.surfaces.parameters)
-
-    def fit_to(self, samples: Samples, members: list[np.ndarray]) -> None:
-        """Fit the surfaces to samples, one set for each, where that explains them no worse."""
-        which = np.array([m for m, s in enumerate(members) if len(s) >= 10], np.int64)
-        sets = [members[m] for m in which]
-        noise = self.tolerance.noise
-        fitted, fits = fit_sets(samples, sets, noise, robust=True)
-        new = lie_on(samples, sets, fitted, fits, 3.0 * noise, 0.5)
-        old = lie_on(samples, sets, fitted, self.surfaces.at(which[fitted]), 3.0 * noise, 0.5)
-        kind, parameters = self.surfaces.kind.copy(), self.surfaces.parameters.copy()
-        for k, f in enumerate(fitted):
-            if new[k].mean() >= old[k].mean() - 0.01:
-                kind[which[f]], parameters[which[f]] = fits.kind[k], fits.parameters[k]
+        point = both.point[np.concatenate([np.zeros(0, np.int64), *sets])]
+        start, kind = np.cumsum([0] + [len(s) for s in sets]), self.surfaces.kind
+        parameters = refine(
+            point, start, kind, self.surfaces.parameters, noise=self.tolerance.noise
+        )
         self.surfaces = Surfaces(kind=kind, parameters=parameters)
+        return covariances(point, start, kind, parameters)
 
     def inner(self) -> np.ndarray:
         """Return which leaves are full of one surface, as are all that touch them; (C,), bool."""

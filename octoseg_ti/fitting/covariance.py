@@ -15,16 +15,17 @@ from octoseg_ti.device.surfaces import (
 PARAMETERS = 8
 """Point (3), axis or normal (3), a and b."""
 
-# What a surface of every kind can do, in the order of `_ways`: its point moves along the axis and
-# along two directions across it, its axis turns towards these two, a and b grow. A plane stays the
-# same where its point moves within it, a cylinder where that moves along the axis.
-_WAYS = {
+WAYS = {
     PLANE: (0, 3, 4),
     CYLINDER: (1, 2, 3, 4, 5),
     CONE: (0, 1, 2, 3, 4, 5),
     SPHERE: (0, 1, 2, 5),
     TORUS: (0, 1, 2, 3, 4, 5, 6),
 }
+"""What a surface of every kind can do, in the order of `ways_of`: its point moves along the axis or
+across it in two directions, its axis turns towards these two, a and b grow. A plane stays the same
+where its point moves within it, a cylinder where that moves along the axis."""
+
 # The parameters that a kind has.
 _HAS = {
     PLANE: (0, 1, 2, 3, 4, 5),
@@ -65,17 +66,17 @@ def covariances(
     change = distance_gradient(points, normal, kind[owner], parameters[owner])
     found = np.full((len(kind), PARAMETERS, PARAMETERS), np.nan)
     for code in range(KINDS):
-        which = np.flatnonzero((kind == code) & (count > len(_WAYS[code])))
+        which = np.flatnonzero((kind == code) & (count > len(WAYS[code])))
         if len(which) == 0:
             continue
         # Padded with points that say nothing.
         place = start[which, None] + np.arange(count[which].max())
         there = place < start[which + 1, None]
         place = np.where(there, place, 0)
-        ways = _ways(parameters[which, 3:6])[:, :, _WAYS[code]]
+        ways = ways_of(parameters[which, 3:6])[:, :, WAYS[code]]
         columns = np.einsum("mni,mik->kmn", change[place], ways) * there
         root = np.einsum("mik,mkj->mij", ways, np.linalg.inv(_triangles(columns)))
-        square = np.sum((far[place] * there) ** 2, axis=1) / (count[which] - len(_WAYS[code]))
+        square = np.sum((far[place] * there) ** 2, axis=1) / (count[which] - len(WAYS[code]))
         has = np.isin(np.arange(PARAMETERS), _HAS[code])
         whole = square[:, None, None] * np.einsum("mik,mjk->mij", root, root)
         found[which] = np.where(has & has[:, None], whole, np.nan)
@@ -110,7 +111,7 @@ def distance_gradient(
     return np.column_stack([-normal, turned, a, np.where(ring, -1.0, 0.0)])
 
 
-def _ways(axis: np.ndarray) -> np.ndarray:
+def ways_of(axis: np.ndarray) -> np.ndarray:
     """Return the seven ways in which parameters can change, by columns, shape (M, 8, 7)."""
     # Any two directions across the axis: the first is across the coordinate that it has least of.
     least = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
