@@ -118,11 +118,11 @@ def give_back(search: Search, strip: np.ndarray, sides: np.ndarray) -> np.ndarra
         [np.abs(evaluate_surfaces(foot, both[:, k], kind, parameters)[0]) for k in range(2)], axis=1
     )
     nearer, least = gap.argmin(axis=1), gap.min(axis=1)
-    # Of a narrow strip the middle stays.
+    # Of a narrow strip the middle stays, and where points are equally far no more than half goes.
     reach = np.full(search.count, WEAK * search.noise)
     for patch in np.unique(own):
         reach[patch] = min(reach[patch], np.median(least[own == patch]))
-    weak = least <= reach[own]
+    weak = least < reach[own]
     label = label.copy()
     label[mine[weak]] = both[weak, nearer[weak]]
     return label

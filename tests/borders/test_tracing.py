@@ -245,6 +245,21 @@ def test_of_a_narrow_strip_the_middle_stays() -> None:
     assert strip.rows(found.label, 1).tolist() == [300]
 
 
+@pytest.mark.parametrize("rows", [2, 3, 4, 5, 7])
+def test_at_least_half_of_a_strip_stays_where_rows_are_as_far_from_both_sides(rows: int) -> None:
+    # Without noise whole rows of points are equally far from the sides.
+    radius = 0.38 * rows / np.pi
+    half = 0.25 * np.pi * radius
+    first = (half - (0.5 * STEP if rows % 2 == 0 else 0.0)) % STEP
+    strip = strip_between(radius, beyond=0.0, scatter=0.0, noise=0.5, first=float(first))
+    assert len(strip.rows(strip.search.label)) == rows
+    sides, of = np.array([[0, 1]], np.int32), np.array([-1, -1, 0], np.int32)
+    before = strip.search.label == 2
+    after = give_back(strip.search, of, sides) == 2
+    assert 2 * np.count_nonzero(after) >= np.count_nonzero(before)
+    assert len(strip.rows(np.where(after, 2, -1))) >= 1
+
+
 def test_what_is_no_strip_gives_nothing_back() -> None:
     strip = strip_between(1.0, beyond=0.15, scatter=0.01, noise=0.013)
     search, none = strip.search, np.zeros((0, 2), np.int32)
