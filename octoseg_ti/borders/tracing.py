@@ -137,7 +137,7 @@ def give_back(
     reach = np.full(search.count, WEAK * search.noise)
     for patch in np.unique(own):
         reach[patch] = min(reach[patch], np.quantile(least[own == patch], _GIVEN))
-    weak = least <= reach[own]
+    weak = least < reach[own]
     label[mine[weak]] = sides[fillet[weak], nearer[weak]]
     return label
 

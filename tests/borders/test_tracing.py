@@ -1,14 +1,20 @@
 """Edges and fillets of simple parts of which all is known."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+from reference.leaves import leaves_of
 from reference.rounded import bend
 
 from octoseg_ti import evaluate, segment
+from octoseg_ti.borders.tracing import find_borders, give_back
+from octoseg_ti.borders.zones import Search
+from octoseg_ti.device import runtime
 from octoseg_ti.evaluation import Scores
 from octoseg_ti.params import EdgeParams, Params
+from octoseg_ti.stages.extraction import Surfaces
 from octoseg_ti.types import EdgeClass, Segmentation, SurfaceKind
 from scanner_sim import StripeScanner, simulate
 from scanner_sim.part import (
@@ -146,3 +152,118 @@ def test_fillets_can_be_left_out() -> None:
     result, _ = scanned(bend(1.5, 90.0, fillet=True), 0.01, params)
     assert result.fillets is not None and len(result.fillets) == 0
     assert not np.any(result.edge == EdgeClass.FILLET)
+
+
+# A strip between two planes, point by point.
+
+STEP, CORNER = 0.2, np.array([1.0, 7.0, 9.0])
+
+
+class Strip(NamedTuple):
+    """A fillet between two planes, 0 and 1; patch 2 is its strip."""
+
+    search: Search
+    along: np.ndarray
+    """Way of every point over the edge, from the one line of contact [mm]."""
+    arc: float
+    """Way to the other one."""
+
+    def rows(self, label: np.ndarray, patch: int = 2) -> np.ndarray:
+        """Return the rows of points along the edge that are of a patch now, and were of the strip.
+
+        Ways are in hundredths of the step, so that they are whole numbers.
+        """
+        mine = (label == patch) & (self.search.label == 2)
+        return np.unique(np.rint(100.0 * self.along[mine] / STEP).astype(int))
+
+
+def strip_between(
+    radius: float, *, beyond: float, scatter: float, noise: float, first: float = 0.0
+) -> Strip:
+    """Return rows of points over an edge; those up to so far ``beyond`` the strip are of it."""
+    arc = 0.5 * np.pi * radius
+    x, along = (
+        a.ravel() for a in np.meshgrid(np.arange(0, 10, STEP), np.arange(-5, arc + 5, STEP) + first)
+    )
+    on = np.clip(along, 0.0, arc)
+    turn, rest = on / radius, along - on
+    normals = np.column_stack([0.0 * turn, np.sin(turn), np.cos(turn)])
+    points = np.column_stack([
+        x, radius * np.sin(turn) + np.minimum(rest, 0.0),
+        radius * (np.cos(turn) - 1.0) - np.maximum(rest, 0.0),
+    ])  # fmt: skip
+    points += CORNER + scatter * np.random.default_rng(0).normal(size=(len(x), 1)) * normals
+    label = np.where(along < -beyond, 0, np.where(along > arc + beyond, 1, 2)).astype(np.int32)
+    parameters = np.full((3, 8), np.nan)
+    parameters[0, :6] = *CORNER, 0, 0, 1
+    parameters[1, :6] = *(CORNER + np.array([0, radius, 0])), 0, 1, 0
+    parameters[2, :7] = *(CORNER - np.array([0, 0, radius])), 1, 0, 0, radius
+    kind = [SurfaceKind.PLANE, SurfaceKind.PLANE, SurfaceKind.CYLINDER]
+    leaves, order, _ = leaves_of(points, 0.45)
+    runtime.ensure_started()
+    search = Search(
+        runtime.upload(points[order]), runtime.upload(normals[order]), leaves, label[order],
+        np.arange(3, dtype=np.int32),
+        Surfaces(kind=np.array(kind, np.int32), parameters=parameters),
+        noise=noise, spacing=STEP, limit=3.0,
+    )  # fmt: skip
+    return Strip(search, along[order], arc)
+
+
+@pytest.mark.parametrize(("radius", "beyond"), [(1.0, 0.22), (2.0, 0.25), (1.0, 0.0)])
+def test_beside_the_lines_of_contact_points_of_a_strip_go_to_the_sides(
+    radius: float, beyond: float
+) -> None:
+    strip = strip_between(radius, beyond=beyond, scatter=0.01, noise=0.013)
+    before = strip.search.label.copy()
+    found = find_borders(strip.search)
+    np.testing.assert_array_equal(strip.search.label, before)
+    assert found.strip.tolist() == [-1, -1, 0]
+    np.testing.assert_allclose(found.radius, -radius, rtol=0.02)
+    np.testing.assert_array_equal(found.label[before != 2], before[before != 2])
+    # The ball leaves a plane by its radius less that times the cosine of the angle that it turns.
+    turn = np.clip(strip.along / strip.arc, 0.0, 1.0) * np.pi / 2.0
+    gap = radius * (1.0 - np.cos(np.minimum(turn, np.pi / 2.0 - turn)))
+    beside = np.where(strip.along < strip.arc / 2.0, 0, 1)
+    near, far = (before == 2) & (gap < 0.02), (before == 2) & (gap > 0.032)
+    assert near.sum() >= 100 and far.sum() >= 200
+    np.testing.assert_array_equal(found.label[near], beside[near])
+    assert (found.label[far] == 2).all()
+    gone = (before == 2) & (found.label != 2)
+    np.testing.assert_array_equal(found.label[gone], beside[gone])
+    assert np.count_nonzero(gone) <= 0.5 * np.count_nonzero(before == 2)
+
+
+def test_of_a_narrow_strip_the_middle_stays() -> None:
+    # All of it is within twice the noise of the planes.
+    strip = strip_between(0.5, beyond=0.0, scatter=0.03, noise=0.08)
+    found = find_borders(strip.search)
+    assert found.strip.tolist() == [-1, -1, 0]
+    assert strip.rows(strip.search.label).tolist() == [0, 100, 200, 300]
+    assert strip.rows(found.label).tolist() == [100, 200]
+    assert strip.rows(found.label, 0).tolist() == [0]
+    assert strip.rows(found.label, 1).tolist() == [300]
+
+
+@pytest.mark.parametrize("rows", [2, 3, 4, 5, 7])
+def test_at_least_half_of_a_strip_stays_where_rows_are_as_far_from_both_sides(rows: int) -> None:
+    # Without noise whole rows of points are equally far from the sides.
+    radius = 0.38 * rows / np.pi
+    half = 0.25 * np.pi * radius
+    first = (half - (0.5 * STEP if rows % 2 == 0 else 0.0)) % STEP
+    strip = strip_between(radius, beyond=0.0, scatter=0.0, noise=0.5, first=float(first))
+    assert len(strip.rows(strip.search.label)) == rows
+    sides, of = np.array([[0, 1]], np.int32), np.array([-1, -1, 0], np.int32)
+    before = strip.search.label == 2
+    after = give_back(strip.search, of, sides) == 2
+    assert 2 * np.count_nonzero(after) >= np.count_nonzero(before)
+    assert len(strip.rows(np.where(after, 2, -1))) >= 1
+
+
+def test_what_is_no_strip_gives_nothing_back() -> None:
+    strip = strip_between(1.0, beyond=0.15, scatter=0.01, noise=0.013)
+    search, none = strip.search, np.zeros((0, 2), np.int32)
+    np.testing.assert_array_equal(give_back(search, np.full(3, -1, np.int32), none), search.label)
+    search.analytic[2] = False
+    sides, of = np.array([[0, 1]], np.int32), np.array([-1, -1, 0], np.int32)
+    np.testing.assert_array_equal(give_back(search, of, sides), search.label)

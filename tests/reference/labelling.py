@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,6 +60,21 @@ def normal_at(point: np.ndarray, kind: int, parameters: np.ndarray) -> np.ndarra
     return slope / np.linalg.norm(slope)
 
 
+class Chosen(NamedTuple):
+    """What a point chooses."""
+
+    label: int
+    """Surface that costs least of those it may take, -1 = none."""
+    second: int
+    """Of all others near it the one that costs least, -1 = none."""
+    off: tuple[float, float, float]
+    """Distance and angle of the second, and by how much it costs more."""
+    margin: float
+    """How near the label is to another."""
+    close: float
+    """How near the second is to another."""
+
+
 def choose(
     point: np.ndarray,
     normal: np.ndarray,
@@ -67,21 +83,30 @@ def choose(
     parameters: np.ndarray,
     handicap: np.ndarray,
     rule: tuple[float, float, float, float],
-) -> tuple[int, float]:
-    """Return the surface that a point takes, -1 = none, and how near the answer is to another."""
+) -> Chosen:
+    """Return the surface that a point takes, and the one that would come next."""
     noise, tilt, reach, turn = rule
     cost: dict[int, float] = {}
+    what: dict[int, tuple[float, float]] = {}
+    allowed: set[int] = set()
     margin = np.inf
     for s in near:
         off = abs(float(distance_of(point[None], kind[s], parameters[s])[0])) / noise
         n = normal_at(point, kind[s], parameters[s])
         angle = math.acos(min(1.0, abs(float(n @ normal)))) if normal.any() else 0.0
         margin = min(margin, abs(off - reach), abs(angle - turn))
+        tilts = angle / tilt
+        what[s] = off, tilts
+        cost[s] = off**2 + handicap[s] + (tilts if tilts < 6.0 else 6.0 + 0.1 * (tilts - 6.0)) ** 2
         if off <= reach and angle <= turn:
-            cost[s] = off**2 + min(angle / tilt, 6.0) ** 2 + handicap[s]
-    if not cost:
-        return -1, margin
-    ordered = sorted(cost.values())
+            allowed.add(s)
+    ordered = sorted(cost[s] for s in allowed)
     if len(ordered) > 1:
         margin = min(margin, ordered[1] - ordered[0])
-    return min(cost, key=lambda s: (cost[s], s)), margin
+    label = min(allowed, key=lambda s: (cost[s], s), default=-1)
+    others = sorted((s for s in near if s != label), key=lambda s: (cost[s], s))
+    if not others:
+        return Chosen(label, -1, (1e30, 1e30, 1e30), margin, np.inf)
+    close = cost[others[1]] - cost[others[0]] if len(others) > 1 else np.inf
+    gap = cost[others[0]] - (cost[label] if label >= 0 else 1e30)
+    return Chosen(label, others[0], (*what[others[0]], gap), margin, close)

@@ -35,7 +35,7 @@ def explained_by_others(
 ) -> list[int]:
     """Return the surfaces whose points are within the limit of those they would choose next.
 
-    Only the rule for surfaces that are no errors of form: give points far enough apart in tilt.
+    And errors of form: what is a little off one that is four times as large, smoothly.
     """
     size = [int((label == m).sum()) for m in range(count)]
     gone: list[int] = []
@@ -44,10 +44,17 @@ def explained_by_others(
         mine = np.flatnonzero(label == m)
         if len(mine) == 0 or m in kept:
             continue
-        far = [min(off[i, 0], 4.0) ** 2 if second[i] >= 0 else 16.0 for i in mine]
+
+        def mean(column: int, cap: float, mine: np.ndarray = mine) -> float:
+            far = [min(off[i, column], cap) ** 2 if second[i] >= 0 else cap**2 for i in mine]
+            return float(np.mean(far))
+
         heirs = [int(second[i]) if second[i] >= 0 else m for i in mine]
         main = {h for h in set(heirs) if 5 * heirs.count(h) >= len(mine)}
-        if np.mean(far) <= limit and not main & set(gone):
+        most = max(sorted(set(heirs)), key=heirs.count)
+        form = most != m and 5 * heirs.count(most) >= 4 * len(mine) and 4 * len(mine) <= size[most]
+        form = form and mean(0, 8.0) <= 16.0 and mean(1, 6.0) <= 9.0
+        if (mean(0, 4.0) <= limit or form) and not main & set(gone):
             gone.append(m)
             kept |= main
     return gone

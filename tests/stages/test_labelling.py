@@ -49,8 +49,8 @@ def sets_of(own: np.ndarray) -> list[set[int]]:
     return [set(row[row >= 0].tolist()) for row in own]
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_choices_equal_the_reference(seed: int) -> None:
+@pytest.mark.parametrize(("seed", "tilt"), [(0, 0.3), (1, 0.3), (2, 0.03)])
+def test_choices_equal_the_reference(seed: int, tilt: float) -> None:
     grid, leaves = surface_leaves(seed, 700)
     rng = np.random.default_rng(seed)
     count = 30
@@ -58,11 +58,11 @@ def test_choices_equal_the_reference(seed: int) -> None:
     handicap = rng.uniform(0.0, 2.0, count)
     closed = rng.random(len(leaves)) < 0.2
     own = random_own(leaves, seed, count)
-    rule = Rule(0.3, 0.3)
+    rule = Rule(0.3, tilt)
     labelling = Labelling(grid, leaves, rule)
     table = surface_table(kind, parameters, handicap)
     held = labelling.choose(own, table, closed=closed)
-    label = runtime.download(labelling.choice.label)
+    label, second, off = (runtime.download(part) for part in labelling.choice)
     touching = [
         set(leaves.neighbor[leaves.start[c] : leaves.start[c + 1]].tolist())
         for c in range(len(leaves))
@@ -70,12 +70,23 @@ def test_choices_equal_the_reference(seed: int) -> None:
     near = near_surfaces(sets_of(own), closed, touching, MOST)
     point, normal = runtime.download(grid.point), runtime.download(grid.normal)
     leaf = np.repeat(np.arange(len(leaves)), leaves.count)
+    turned_away = 0
     for i in range(len(point)):
-        expected, margin = choose(
+        expected = choose(
             point[i], normal[i], near[leaf[i]], kind, parameters, handicap, tuple(rule)
         )
-        assert label[i] == expected or margin < 1e-6, f"seed {seed}, point {i}"
+        where = f"seed {seed}, point {i}"
+        assert label[i] == expected.label or expected.margin < 1e-6, where
+        if min(expected.margin, expected.close) < 1e-6:
+            continue
+        assert second[i] == expected.second, where
+        told = slice(3 if expected.label >= 0 else 2)  # by how much it costs more than none?
+        np.testing.assert_allclose(
+            off[i][told], expected.off[told], rtol=1e-5, atol=1e-3, err_msg=where
+        )
+        turned_away += int(expected.second >= 0 and expected.off[1] * tilt > rule.turn)
     assert (label >= 0).sum() > 100
+    assert turned_away > 50
     for c, mine in enumerate(sets_of(held)):
         assert mine == {int(x) for x in label[leaf == c] if x >= 0}
 
@@ -109,9 +120,33 @@ def test_the_nearest_of_two_planes_is_taken_and_the_other_comes_second() -> None
     labelling = Labelling(grid, leaves, Rule(0.1, 10.0, reach=1e9, turn=4.0))
     labelling.choose(own, surface_table(np.zeros(2, np.int32), parameters))
     off = np.abs(point[:, 2, None] - parameters[:, 2])
-    np.testing.assert_array_equal(
-        runtime.download(labelling.choice.label), (off[:, 1] < off[:, 0]).astype(int)
-    )
+    label, second, _ = (runtime.download(part) for part in labelling.choice)
+    np.testing.assert_array_equal(label, (off[:, 1] < off[:, 0]).astype(int))
+    np.testing.assert_array_equal(second, 1 - label)
+
+
+@pytest.mark.parametrize("own", [0, 1, 2])
+def test_what_comes_next_may_be_turned_away_or_anywhere_in_the_list(own: int) -> None:
+    grid, leaves = surface_leaves(0, 700)
+    point, normal = runtime.download(grid.point), runtime.download(grid.normal)
+    i = int(np.flatnonzero(normal.any(axis=1))[0])
+    across = np.cross(normal[i], [0.6, 0.0, 0.8])
+    across /= np.linalg.norm(across)
+    # One that the point takes, one that it is on but that faces elsewhere, one that is far off.
+    planes = np.full((3, 8), np.nan)
+    planes[:, :3], planes[:, 3:6] = point[i], normal[i]
+    planes[own, :3] += 0.1 * normal[i]
+    turned, far = (s for s in range(3) if s != own)
+    planes[turned, 3:6] = across
+    planes[far, :3] += 50.0 * normal[i]
+    every = own_lists(leaves, np.repeat(np.arange(len(leaves)), 3), np.tile(range(3), len(leaves)))
+    labelling = Labelling(grid, leaves, Rule(0.1, 0.1))
+    labelling.choose(every, surface_table(np.zeros(3, np.int32), planes))
+    label, second, off = (runtime.download(part)[i] for part in labelling.choice)
+    assert (label, second) == (own, turned)
+    tilts = np.pi / 2 / 0.1
+    expected = 0.0, tilts, (6.0 + 0.1 * (tilts - 6.0)) ** 2 - 1.0
+    np.testing.assert_allclose(off, expected, rtol=1e-5, atol=1e-3)
 
 
 def test_labels_of_leaves() -> None:

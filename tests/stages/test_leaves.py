@@ -1,5 +1,7 @@
 """Samples are the points with the smallest hashes; leaves whose boxes touch are a graph."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from reference.clouds import random_surface
@@ -9,7 +11,7 @@ from reference.labelling import pick
 
 from octoseg_ti.device import runtime
 from octoseg_ti.stages.grid import build_grid
-from octoseg_ti.stages.leaves import sample_leaves, without_gaps
+from octoseg_ti.stages.leaves import joined_samples, sample_leaves, without_gaps
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -77,3 +79,18 @@ def test_samples_do_not_depend_on_the_order_of_the_points() -> None:
         grid = build_grid(p, n, tolerance=0.05, min_cell=0.7, min_points=3)
         picked.append(sample_leaves(grid, touching_leaves(grid), 3).point)
     np.testing.assert_array_equal(*picked)
+
+
+def test_joined_samples_are_those_of_both() -> None:
+    grid, leaves = surface_leaves(3)
+    label = np.random.default_rng(3).integers(-1, 2, grid.order.shape[0]).astype(np.int32)
+    one = sample_leaves(grid, leaves, 2, label=label)
+    other = sample_leaves(grid, leaves, 5, label=-1 - label)
+    both = joined_samples(one, other)
+    assert len(both) == len(one) + len(other)
+    for name in ("index", "leaf", "point", "normal", "weight"):
+        first, second = np.split(getattr(both, name), [len(one)])
+        np.testing.assert_array_equal(first, getattr(one, name))
+        np.testing.assert_array_equal(second, getattr(other, name))
+    assert both.signed == one.signed
+    assert not joined_samples(replace(one, signed=False), other).signed

@@ -93,6 +93,45 @@ def test_surfaces_explained_by_others_equal_the_reference(seed: int, count: int)
     assert not gone.all()
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_errors_of_form_equal_the_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n, count = 6000, 24
+    # Three large surfaces; what is small leans mostly on one of these, on two, or on none.
+    label = rng.choice(count, n, p=np.repeat([0.25, 0.25 / 21], [3, 21])).astype(np.int32)
+    leans = rng.uniform(0.5, 1.0, count)
+    second = np.where(rng.random(n) < leans[label], label % 3, (label + 1) % 3)
+    second = np.where(label < 3, (label + 1) % 3, second)
+    second[rng.random(n) < 0.02] = -1
+    far, turned = rng.uniform(1.0, 6.0, count), rng.uniform(0.5, 5.0, count)
+    off = np.stack([rng.normal(spread[label]) for spread in (far, turned)], axis=1)
+    off = np.abs(off).astype(np.float32)
+    off[label < 3] = 30.0
+    gone = np.flatnonzero(explained_by_others(label, second.astype(np.int32), off, count, 2.0))
+    assert set(gone.tolist()) == set(meeting.explained_by_others(label, second, off, count, 2.0))
+    calm = [np.mean(np.minimum(off[label == m, 0], 4.0) ** 2) <= 2.0 for m in gone]
+    assert 0 < len(gone) < 21 and not all(calm)
+
+
+def test_a_shallow_round_between_two_planes_is_no_error_of_form() -> None:
+    label = np.repeat([0, 1, 2], [1000, 900, 100]).astype(np.int32)
+    off = np.full((2000, 2), 30.0, np.float32)
+    off[label == 2] = 2.5, 1.0
+
+    def given_up(share: float) -> list[bool]:
+        second = np.where(label == 0, 1, 0)
+        second[1900 + round(100 * share) :] = 1
+        return explained_by_others(label, second.astype(np.int32), off, 3, 2.0).tolist()
+
+    for share in (0.5, 0.3, 0.75, 0.21):
+        assert not any(given_up(share))
+    for share in (1.0, 0.85, 0.15):
+        assert given_up(share) == [False, False, True]
+    # What both of them explain goes wherever it leans.
+    off[label == 2] = 1.2, 1.0
+    assert given_up(0.5) == [False, False, True]
+
+
 def test_a_small_smooth_error_of_form_is_given_up() -> None:
     label = np.repeat([0, 1], [1000, 60]).astype(np.int32)
     second = 1 - label

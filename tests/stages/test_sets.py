@@ -6,13 +6,36 @@ from reference.device_grid import samples_of
 from reference.labelling import normal_at
 from reference.surfaces import CONE, CYLINDER, PLANE, SPHERE, TORUS, distance_of, patch_of
 
-from octoseg_ti.stages.sets import Surfaces, fit_sets, joined, lie_on, no_surfaces, spread
+from octoseg_ti.stages.sets import (
+    Surfaces,
+    fit_sets,
+    joined,
+    lie_on,
+    nearness,
+    no_surfaces,
+    spread,
+)
 
 KINDS = (PLANE, CYLINDER, CONE, SPHERE, TORUS)
 
 
+def near_plainly(
+    points: np.ndarray, normals: np.ndarray, kind: int, parameters: np.ndarray,
+    limit: float, turn: float,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return how near a surface samples lie, and how far that is from being otherwise."""
+    far = np.abs(distance_of(points, kind, parameters))
+    slope = np.stack([normal_at(p, kind, parameters) for p in points])
+    there = normals.any(axis=1)
+    facing = np.where(there, np.abs(np.sum(slope * normals, axis=1)), 1.0)
+    near = np.where(far <= limit, 1.0 - (far / limit) ** 2, 0.0)
+    near *= np.where(facing >= np.cos(turn), 1.0 - (1.0 - facing) / (1.0 - np.cos(turn)), 0.0)
+    return near, np.minimum(np.abs(far - limit), np.abs(facing - np.cos(turn)))
+
+
 @pytest.mark.parametrize("seed", range(3))
-def test_what_lies_on_surfaces_equals_the_reference(seed: int) -> None:
+@pytest.mark.parametrize("turn", [0.3, 1.0])
+def test_how_near_samples_are_to_surfaces_equals_the_reference(seed: int, turn: float) -> None:
     rng = np.random.default_rng(seed)
     points = rng.normal(0.0, 5.0, (300, 3))
     normals = rng.normal(size=(300, 3))
@@ -23,15 +46,38 @@ def test_what_lies_on_surfaces_equals_the_reference(seed: int) -> None:
     surfaces = Surfaces(kind=np.repeat(KINDS, 2).astype(np.int32), parameters=parameters)
     sets = [np.flatnonzero(rng.random(300) < share) for share in (0.3, 0.8, 0.5)]
     which = rng.integers(0, 3, 10)
-    found = lie_on(samples_of(points, normals), sets, which, surfaces, 1.0, 1.0)
-    for s, on in enumerate(found):
+    samples = samples_of(points, normals)
+    found = nearness(samples, sets, which, surfaces, 1.0, turn)
+    there = lie_on(samples, sets, which, surfaces, 1.0, turn)
+    some = 0
+    for s, (near, on) in enumerate(zip(found, there, strict=True)):
         mine = sets[which[s]]
-        far = np.abs(distance_of(points[mine], surfaces.kind[s], parameters[s]))
-        slope = np.stack([normal_at(p, surfaces.kind[s], parameters[s]) for p in points[mine]])
-        cosine = np.abs(np.sum(slope * normals[mine], axis=1))
-        turned = (cosine < np.cos(1.0)) & normals[mine].any(axis=1)
-        clear = (np.abs(far - 1.0) > 1e-6) & (np.abs(cosine - np.cos(1.0)) > 1e-6)
-        np.testing.assert_array_equal(on[clear], ((far <= 1.0) & ~turned)[clear])
+        expected, margin = near_plainly(
+            points[mine], normals[mine], int(surfaces.kind[s]), parameters[s], 1.0, turn
+        )
+        clear = margin > 1e-6
+        np.testing.assert_allclose(near[clear], expected[clear], atol=2e-6)
+        np.testing.assert_array_equal(on[clear], expected[clear] > 0.0)
+        assert near.dtype == np.float32 and on.dtype == bool
+        some += np.count_nonzero(on)
+    assert some > (10 if turn < 1.0 else 100)
+
+
+def test_what_lies_at_a_limit_still_lies_on_the_surface() -> None:
+    points = np.array([(0, 0, 0), (0, 0, 1), (0, 0, -2), (0, 0, 2), (0, 0, 2.001)], float)
+    normals = np.zeros((5, 3))
+    level = np.array([[0, 0, 0, 0, 0, 1, np.nan, np.nan]])
+    plane = Surfaces(kind=np.zeros(1, np.int32), parameters=level)
+    every, first = [np.arange(5)], np.zeros(1, int)
+    samples = samples_of(points, normals)
+    (near,) = nearness(samples, every, first, plane, 2.0, 0.5)
+    np.testing.assert_allclose(near, [1.0, 0.75, 0.0, 0.0, 0.0], atol=2e-6)
+    (on,) = lie_on(samples, every, first, plane, 2.0, 0.5)
+    assert on.tolist() == [True, True, True, True, False]
+    # A tilt counts by its cosine, of either side of the sample.
+    tilted = np.array([(0, np.sin(a), np.cos(a)) for a in (0.0, np.arccos(0.75), 1.0, 1.1, np.pi)])
+    (near,) = nearness(samples_of(0.0 * points, tilted), every, first, plane, 2.0, np.pi / 3)
+    np.testing.assert_allclose(near, [1.0, 0.5, 2 * np.cos(1.0) - 1, 0.0, 1.0], atol=2e-6)
 
 
 def test_nothing_lies_on_no_surface() -> None:
