@@ -52,7 +52,10 @@ def readmit(
     least = np.full(len(outside), _ON * noise)
     for patch, mine, far in _near(outside, there, surface[patches], patches, kind, parameters,
                                   _ON * noise):  # fmt: skip
-        mine, far = mine[far <= least[mine]], far[far <= least[mine]]
+        better = far <= least[mine]
+        mine, far = mine[better], far[better]
+        if len(mine) == 0:
+            continue
         linked = _linked(outside[mine], point[label == patch], gap)
         found[mine[linked]], least[mine[linked]] = patch, far[linked]
     return found

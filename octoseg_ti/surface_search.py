@@ -39,9 +39,9 @@ from octoseg_ti.stages.merging import (
     merge_surfaces,
     smooth_contacts,
 )
-from octoseg_ti.stages.sets import Surfaces, fit_sets, lie_on, no_surfaces, spread
+from octoseg_ti.stages.sets import Surfaces, fit_sets, flat_sets, lie_on, no_surfaces, spread
 from octoseg_ti.stages.settling import settle
-from octoseg_ti.types import NONE
+from octoseg_ti.types import NONE, SurfaceKind
 
 NARROW = 2.0
 """Normals of narrow faces, and of points at edges, may be off so many times more than others."""
@@ -61,7 +61,7 @@ _AROUND, _HARDLY = 12, 1e-3
 # A leaf takes part in a new group when so many of its points fit nothing, or one in so many.
 _LEFT_POINTS, _LEFT_SHARE = 2, 3
 # Samples for fitting a surface anew.
-_REFIT = 300
+_REFIT, _FEWEST = 300, 10
 # ... and in the end, when it is settled which points are its own; of one leaf at most.
 _SETTLED, _DENSE = 600, 32
 # ... away from other surfaces, if there are so many of these.
@@ -187,7 +187,7 @@ class _Search:
             i if len(i) >= _INNER and 4 * len(i) >= len(m) else m
             for i, m in zip(inner, members, strict=True)
         ]
-        which = np.array([m for m, s in enumerate(members) if len(s) >= 10], np.int64)
+        which = np.array([m for m, s in enumerate(members) if len(s) >= _FEWEST], np.int64)
         sets = [spread(members[m], _REFIT) for m in which]
         noise = self.tolerance.noise
         fitted, fits = fit_sets(self.samples, sets, noise, robust=True)
@@ -220,11 +220,15 @@ class _Search:
         both = joined_samples(self.samples, more)
         name = np.concatenate([np.where(few[of], NONE, of), label[more.index]])
         sets = [spread(m, _SETTLED) for m in members_of(name, count)]
+        noise = self.tolerance.noise
+        kind, parameters = self.surfaces.kind.copy(), self.surfaces.parameters.copy()
+        # Some points of the next surface can bend a plane.
+        curved = np.flatnonzero((kind != SurfaceKind.PLANE) & [len(s) >= _FEWEST for s in sets])
+        flat, planes = flat_sets(both, [sets[k] for k in curved], noise)
+        kind[curved[flat]], parameters[curved[flat]] = SurfaceKind.PLANE, planes[flat]
         point = both.point[np.concatenate([np.zeros(0, np.int64), *sets])]
-        start, kind = np.cumsum([0] + [len(s) for s in sets]), self.surfaces.kind
-        parameters = refine(
-            point, start, kind, self.surfaces.parameters, noise=self.tolerance.noise
-        )
+        start = np.cumsum([0] + [len(s) for s in sets])
+        parameters = refine(point, start, kind, parameters, noise=noise)
         self.surfaces = Surfaces(kind=kind, parameters=parameters)
         return covariances(point, start, kind, parameters)
 

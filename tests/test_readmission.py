@@ -65,6 +65,16 @@ def test_of_two_patches_the_nearer_one_takes_a_point() -> None:
         assert (found ^ first).tolist() == [0, 1, 0, 1]
 
 
+def test_a_patch_that_is_farther_from_all_points_takes_none() -> None:
+    point = np.concatenate([square(0.0), square(0.04) + np.array([4.0, 0.0, 0.0])])
+    label = np.repeat([0, 1], len(point) // 2).astype(np.int32)
+    found = readmit(
+        np.array([(4.5, 2.1, 0.01)]), point, label, np.array([0, 1]), np.array([PLANE, PLANE]),
+        np.array([level(0.0), level(0.04)]), noise=NOISE, gap=GAP,
+    )  # fmt: skip
+    assert found.tolist() == [0]
+
+
 def test_what_has_no_place_or_no_surface_stays_out() -> None:
     assert come_back([(NAN, NAN, NAN), (2, 2, 0.0), (2, NAN, 0)]) == [-1, 0, -1]
     assert come_back([(2, 2, 0.0)], surface=-1) == [-1]

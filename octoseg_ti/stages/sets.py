@@ -198,12 +198,8 @@ def fit_sets(
     """
     if not sets:
         return np.zeros(0, np.int64), no_surfaces()
-    kind = np.full(len(sets), int(SurfaceKind.FREE_FORM), np.int32)
-    parameters = np.full((len(sets), 8), np.nan)
-    index, start = _in_a_row(sets)
-    flat = fit_quadrics(samples.point[index], samples.normal[index], start)
-    kind[plane_does(flat, np.diff(start), noise=noise, room=_FIT)] = int(SurfaceKind.PLANE)
-    parameters[:, :6] = np.column_stack([flat.centre, flat.normal])
+    flat, parameters = flat_sets(samples, sets, noise)
+    kind = np.where(flat, int(SurfaceKind.PLANE), int(SurfaceKind.FREE_FORM)).astype(np.int32)
     curved = np.flatnonzero(kind >= KINDS)
     if len(curved):
         index, start = _in_a_row([sets[s] for s in curved])
@@ -214,6 +210,28 @@ def fit_sets(
         kind[curved], parameters[curved] = chosen.kind, chosen.parameters
     fitted = np.flatnonzero((kind >= 0) & (kind < KINDS))
     return fitted, Surfaces(kind=kind[fitted], parameters=parameters[fitted])
+
+
+def flat_sets(
+    samples: Samples, sets: list[np.ndarray], noise: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Say which sets lie on planes that no curved surface could better.
+
+    Args:
+        samples: The samples.
+        sets: Sets of samples.
+        noise: Deviation of a point from its surface [mm].
+
+    Returns:
+        Shape (len(sets),), bool; and the planes, as in `Segmentation.parameters`, of all sets.
+    """
+    parameters = np.full((len(sets), 8), np.nan)
+    if not sets:
+        return np.zeros(0, bool), parameters
+    index, start = _in_a_row(sets)
+    flat = fit_quadrics(samples.point[index], samples.normal[index], start)
+    parameters[:, :6] = np.column_stack([flat.centre, flat.normal])
+    return plane_does(flat, np.diff(start), noise=noise, room=_FIT), parameters
 
 
 def _in_a_row(sets: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

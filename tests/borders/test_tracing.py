@@ -210,43 +210,42 @@ def strip_between(
     return Strip(search, along[order], arc)
 
 
-@pytest.mark.parametrize(("radius", "beyond"), [(1.0, 0.22), (2.0, 0.25), (1.0, 0.0)])
-def test_beside_the_lines_of_contact_points_of_a_strip_go_to_the_sides(
-    radius: float, beyond: float
+@pytest.mark.parametrize(("radius", "beyond_mm"), [(1.0, 0.22), (2.0, 0.25), (1.0, 0.0)])
+def test_beyond_the_lines_of_contact_points_of_a_strip_go_to_the_sides(
+    radius: float, beyond_mm: float
 ) -> None:
-    strip = strip_between(radius, beyond=beyond, scatter=0.01, noise=0.013)
+    strip = strip_between(radius, beyond=beyond_mm, scatter=0.01, noise=0.013)
     before = strip.search.label.copy()
     found = find_borders(strip.search)
     np.testing.assert_array_equal(strip.search.label, before)
     assert found.strip.tolist() == [-1, -1, 0]
     np.testing.assert_allclose(found.radius, -radius, rtol=0.02)
     np.testing.assert_array_equal(found.label[before != 2], before[before != 2])
-    # The ball leaves a plane by its radius less that times the cosine of the angle that it turns.
-    turn = np.clip(strip.along / strip.arc, 0.0, 1.0) * np.pi / 2.0
-    gap = radius * (1.0 - np.cos(np.minimum(turn, np.pi / 2.0 - turn)))
     beside = np.where(strip.along < strip.arc / 2.0, 0, 1)
-    near, far = (before == 2) & (gap < 0.02), (before == 2) & (gap > 0.032)
-    assert near.sum() >= 100 and far.sum() >= 200
-    np.testing.assert_array_equal(found.label[near], beside[near])
-    assert (found.label[far] == 2).all()
+    # Beyond the lines of contact all go; within them one in seven at most, the nearest to them.
+    inside = (before == 2) & (strip.along > 0.02) & (strip.along < strip.arc - 0.02)
+    beyond = (before == 2) & ((strip.along < -0.02) | (strip.along > strip.arc + 0.02))
+    assert np.count_nonzero(inside) >= 200 and (beyond.any() or beyond_mm < 0.02)
+    np.testing.assert_array_equal(found.label[beyond], beside[beyond])
     gone = (before == 2) & (found.label != 2)
     np.testing.assert_array_equal(found.label[gone], beside[gone])
-    assert np.count_nonzero(gone) <= 0.5 * np.count_nonzero(before == 2)
+    assert np.count_nonzero(gone & inside) <= 0.15 * np.count_nonzero(inside) + 1
+    deep = np.minimum(strip.along, strip.arc - strip.along)
+    assert not (gone & (deep > 0.25 * strip.arc)).any()
 
 
-def test_of_a_narrow_strip_the_middle_stays() -> None:
+def test_of_a_narrow_strip_the_most_stays() -> None:
     # All of it is within twice the noise of the planes.
     strip = strip_between(0.5, beyond=0.0, scatter=0.03, noise=0.08)
     found = find_borders(strip.search)
     assert found.strip.tolist() == [-1, -1, 0]
     assert strip.rows(strip.search.label).tolist() == [0, 100, 200, 300]
-    assert strip.rows(found.label).tolist() == [100, 200]
-    assert strip.rows(found.label, 0).tolist() == [0]
-    assert strip.rows(found.label, 1).tolist() == [300]
+    stayed = np.count_nonzero(found.label == 2)
+    assert stayed >= 0.8 * np.count_nonzero(strip.search.label == 2)
 
 
 @pytest.mark.parametrize("rows", [2, 3, 4, 5, 7])
-def test_at_least_half_of_a_strip_stays_where_rows_are_as_far_from_both_sides(rows: int) -> None:
+def test_a_strip_stays_where_rows_are_as_far_from_both_sides(rows: int) -> None:
     # Without noise whole rows of points are equally far from the sides.
     radius = 0.38 * rows / np.pi
     half = 0.25 * np.pi * radius
@@ -255,15 +254,17 @@ def test_at_least_half_of_a_strip_stays_where_rows_are_as_far_from_both_sides(ro
     assert len(strip.rows(strip.search.label)) == rows
     sides, of = np.array([[0, 1]], np.int32), np.array([-1, -1, 0], np.int32)
     before = strip.search.label == 2
-    after = give_back(strip.search, of, sides) == 2
-    assert 2 * np.count_nonzero(after) >= np.count_nonzero(before)
+    after = give_back(strip.search, of, sides, np.array([-radius])) == 2
+    assert np.count_nonzero(after) >= 0.85 * np.count_nonzero(before)
     assert len(strip.rows(np.where(after, 2, -1))) >= 1
 
 
 def test_what_is_no_strip_gives_nothing_back() -> None:
     strip = strip_between(1.0, beyond=0.15, scatter=0.01, noise=0.013)
     search, none = strip.search, np.zeros((0, 2), np.int32)
-    np.testing.assert_array_equal(give_back(search, np.full(3, -1, np.int32), none), search.label)
+    np.testing.assert_array_equal(
+        give_back(search, np.full(3, -1, np.int32), none, np.zeros(0)), search.label
+    )
     search.analytic[2] = False
     sides, of = np.array([[0, 1]], np.int32), np.array([-1, -1, 0], np.int32)
-    np.testing.assert_array_equal(give_back(search, of, sides), search.label)
+    np.testing.assert_array_equal(give_back(search, of, sides, np.array([-1.0])), search.label)
