@@ -241,7 +241,7 @@ def test_of_a_narrow_strip_the_most_stays() -> None:
     assert found.strip.tolist() == [-1, -1, 0]
     assert strip.rows(strip.search.label).tolist() == [0, 100, 200, 300]
     stayed = np.count_nonzero(found.label == 2)
-    assert stayed >= 0.8 * np.count_nonzero(strip.search.label == 2)
+    assert stayed >= 0.7 * np.count_nonzero(strip.search.label == 2)
 
 
 @pytest.mark.parametrize("rows", [2, 3, 4, 5, 7])
