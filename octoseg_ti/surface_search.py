@@ -223,7 +223,8 @@ class _Search:
         noise = self.tolerance.noise
         kind, parameters = self.surfaces.kind.copy(), self.surfaces.parameters.copy()
         # Some points of the next surface can bend a plane.
-        curved = np.flatnonzero((kind != SurfaceKind.PLANE) & [len(s) >= _FEWEST for s in sets])
+        many = np.array([len(s) >= _FEWEST for s in sets], bool)
+        curved = np.flatnonzero((kind != SurfaceKind.PLANE) & many)
         flat, planes = flat_sets(both, [sets[k] for k in curved], noise)
         kind[curved[flat]], parameters[curved[flat]] = SurfaceKind.PLANE, planes[flat]
         point = both.point[np.concatenate([np.zeros(0, np.int64), *sets])]
