@@ -69,10 +69,7 @@ def covariances(
         which = np.flatnonzero((kind == code) & (count > len(WAYS[code])))
         if len(which) == 0:
             continue
-        # Padded with points that say nothing.
-        place = start[which, None] + np.arange(count[which].max())
-        there = place < start[which + 1, None]
-        place = np.where(there, place, 0)
+        place, there = padded(start, which)
         ways = ways_of(parameters[which, 3:6])[:, :, WAYS[code]]
         columns = np.einsum("mni,mik->kmn", change[place], ways) * there
         root = np.einsum("mik,mkj->mij", ways, np.linalg.inv(_triangles(columns)))
@@ -109,6 +106,18 @@ def distance_gradient(
     a[ring] = -np.einsum("si,si->s", normal, away)[ring] / np.maximum(rho[ring], 1e-300)
     turned = slope[:, None] * q - height[:, None] * normal
     return np.column_stack([-normal, turned, a, np.where(ring, -1.0, 0.0)])
+
+
+def padded(start: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points of some groups in a table, and which entries are points and no padding.
+
+    Args:
+        start: First point of every group, and S at the end, shape (M + 1,).
+        which: The groups, at least one, shape (m,).
+    """
+    place = start[which, None] + np.arange((start[which + 1] - start[which]).max())
+    there = place < start[which + 1, None]
+    return np.where(there, place, 0), there
 
 
 def ways_of(axis: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from octoseg_ti.device.surfaces import KINDS, evaluate_surfaces
-from octoseg_ti.fitting.covariance import WAYS, distance_gradient, ways_of
+from octoseg_ti.fitting.covariance import WAYS, distance_gradient, padded, ways_of
 
 TUKEY = 4.685
 """The weight of a point ends at so many deviations (Tukey's biweight)."""
@@ -66,9 +66,7 @@ def _stepped(
         which = np.flatnonzero((kind == code) & (count > len(WAYS[code])))
         if len(which) == 0:
             continue
-        place = start[which, None] + np.arange(count[which].max())
-        there = place < start[which + 1, None]
-        place = np.where(there, place, 0)
+        place, there = padded(start, which)
         ways = ways_of(parameters[which, 3:6])[:, :, WAYS[code]]
         columns = np.einsum("mni,mik->kmn", change[place], ways) * there
         # No product of matrices: its sums may depend on the threads.
