@@ -40,7 +40,7 @@ from octoseg_ti.stages.merging import (
     smooth_contacts,
 )
 from octoseg_ti.stages.sets import Surfaces, fit_sets, flat_sets, lie_on, no_surfaces, spread
-from octoseg_ti.stages.settling import settle
+from octoseg_ti.stages.settling import DOUBT, settle
 from octoseg_ti.types import NONE, SurfaceKind
 
 NARROW = 2.0
@@ -48,7 +48,7 @@ NARROW = 2.0
 EXPLAINED = 2.0
 """A surface is given up when its neighbours explain its points with this mean square, in noises."""
 
-AROUND = 2.0
+AROUND = 1.0
 """Points within so many smallest cells tell on which of two surfaces one lies."""
 FREE = 10.0
 """A free form has at least this many times the points of the smallest patch."""
@@ -119,6 +119,8 @@ class _Search:
                 surface_table(self.surfaces.kind, self.surfaces.parameters),
                 reach=AROUND * float(self.leaves.size.min()),
                 farthest=self.labelling.rule.reach,
+                # The noise of exact positions is taken large to be safe.
+                doubt=0.0 if self.tolerance.exact else DOUBT,
             )  # fmt: skip
         return self._label
 

@@ -47,7 +47,8 @@ def _lead(
 ):  # fmt: skip
     """Return by how much point j, of surface a or b, is on the first rather than the second."""
     other = ti.select(label_in[j] == a, b, a)
-    lead = ti.select(second_in[j] == other, ti.min(ti.cast(off_in[j, 2], ti.f64), DOUBT), DOUBT)
+    sure = ti.max(0.0, ti.min(ti.cast(off_in[j, 2], ti.f64), DOUBT))
+    lead = ti.select(second_in[j] == other, sure, DOUBT)
     return ti.select(label_in[j] == a, lead, -lead)
 
 
@@ -81,6 +82,7 @@ def _ask(
 def _settle(
     reach: ti.f64,
     farthest: ti.f64,
+    doubt: ti.f64,
     # In:
     point_in: F64Rows,
     surface_in: F64Rows,
@@ -104,7 +106,7 @@ def _settle(
                 g, m = surface_in_row(surface_in, b, ti.cast(surface_in[b, 8], ti.i32), p)
                 flat = surface_in[a, 8] == _PLANE and surface_in[b, 8] == _PLANE
                 crossing = flat or n.cross(m).norm() > _ACROSS
-                if crossing or off_in[i, 2] < DOUBT:
+                if crossing or off_in[i, 2] < doubt:
                     told = vec3(0.0, 0.0, 0.0)
                     for k in range(link_in[c, 2] - 1, link_in[c, 3]):
                         d = c
@@ -132,6 +134,7 @@ def settle(
     *,
     reach: float,
     farthest: float,
+    doubt: float = DOUBT,
 ) -> np.ndarray:
     """Return the labels of all points, settled by what lies around them where two would do.
 
@@ -144,6 +147,8 @@ def settle(
         surfaces: The surfaces (`labelling.surface_table`), shape (M, 10).
         reach: Points within this distance count [mm].
         farthest: Only a surface within so many noises of a point can be its own.
+        doubt: Where surfaces touch, a choice is in doubt when the next one costs less than this
+            more; 0 = each point tells best, as where the noise is not known to be so large.
 
     Returns:
         Surface of every sorted point, -1 = none, shape (n,), i32.
@@ -160,7 +165,7 @@ def settle(
         [leaves.first, leaves.first + leaves.count, leaves.start[:-1], leaves.start[1:]], axis=1
     )
     _settle(
-        reach, farthest, points, runtime.upload(surfaces),
+        reach, farthest, doubt, points, runtime.upload(surfaces),
         label, second, off,
         runtime.upload(box), runtime.upload(link), runtime.upload(leaves.neighbor), settled,
     )  # fmt: skip
