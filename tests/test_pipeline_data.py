@@ -45,6 +45,14 @@ def test_facets_of_a_steel_column(shared: Path) -> None:
     assert (scores.patches, scores.correct) == (16, 16)
 
 
+def test_faces_of_a_polyhedral_scene_are_found(shared: Path) -> None:
+    """Of 13 labels three have less than 21 points, one of them scattered; one face is grazed."""
+    points, stripe, labels = stripes_of(shared, "synpeb_100.npz")
+    scores = evaluate(segment(points, stripe=stripe), labels).regions
+    assert scores.patches == 13 and scores.correct >= 9
+    assert scores.ari > 0.99
+
+
 @pytest.mark.parametrize("name", ["bun000", "bun045"])
 def test_a_free_form_gets_no_large_plane(shared: Path, tmp_path: Path, name: str) -> None:
     packed = shared / "stanford_bunny" / f"{name}.ply.gz"
