@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from octoseg_ti.stages.assignment import (
 )
 from octoseg_ti.stages.bends import split_at_bends
 from octoseg_ti.stages.grid import Grid
+from octoseg_ti.stages.labelling import common_label
 from octoseg_ti.stages.leaves import Leaves
 from octoseg_ti.stages.moments import LEVEL, NORMAL, SIGMA, STOP, X, Z
 from octoseg_ti.stages.planes import fit_planes
@@ -238,6 +239,22 @@ def assemble(
         cells=cells, stripe=scans.stripe, view=scans.view, params=params, measured=measured,
         passes=grid.passes, name=scans.name,
     )  # fmt: skip
+
+
+def relabelled(grid: Grid, leaves: np.ndarray, found: Regions, label: np.ndarray) -> Regions:
+    """Return the regions with other labels of the points; a cell has the one that all of its have.
+
+    Args:
+        grid: The sparse grid.
+        leaves: The nodes that are leaves, in Morton order, shape (C,).
+        found: The regions, with the leaves as a graph.
+        label: Region of every sorted point, -1 = none, shape (n,), i32.
+    """
+    assert found.graph is not None
+    held = np.full(grid.count, NONE, np.int32)
+    held[leaves] = common_label(found.graph, label)
+    cell_label = np.where(found.cell_label >= 0, held, NONE).astype(np.int32)
+    return replace(found, label=label, cell_label=cell_label)
 
 
 def _come_back(outside: np.ndarray, grid: Grid, found: Regions, params: Params) -> np.ndarray:

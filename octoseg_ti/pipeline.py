@@ -18,7 +18,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.profiling import Trace
 from octoseg_ti.mirrors import without_mirror_images
 from octoseg_ti.params import Params, SurfaceParams, preset_params
-from octoseg_ti.patches import Regions, assemble, grow_regions
+from octoseg_ti.patches import Regions, assemble, grow_regions, relabelled
 from octoseg_ti.stages.cleaning import mark_outliers
 from octoseg_ti.stages.edges import edges_by_level, edges_by_radius, edges_by_reason
 from octoseg_ti.stages.extraction import Surfaces
@@ -116,7 +116,7 @@ def segment(
     with stage("borders"):
         borders = trace_borders(scans, arranged, point, probe, grid, found, measured, params)
         if borders is not None:
-            found = replace(found, label=borders.label)
+            found = relabelled(grid, leaves, found, borders.label)
     with stage("patches"):
         result = assemble(
             scans, arranged, point, normal, grid, leaves, found, borders, measured, params

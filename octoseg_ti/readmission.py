@@ -2,7 +2,7 @@
 
 Where a surface is seen at a grazing angle its points are far apart, and cleaning, which knows no
 surface yet, finds nothing that holds them. A point that lies on the surface of a patch within the
-noise, no farther from the points of that patch than the longest edge of a triangle, is no outlier;
+noise, no farther from the points of that patch than these may be from each other, is no outlier;
 nor is the next one, so that patches grow to where they end.
 """
 

@@ -47,7 +47,6 @@ NARROW = 2.0
 """Normals of narrow faces, and of points at edges, may be off so many times more than others."""
 EXPLAINED = 2.0
 """A surface is given up when its neighbours explain its points with this mean square, in noises."""
-
 AROUND = 1.0
 """Points within so many smallest cells tell on which of two surfaces one lies."""
 FREE = 10.0
@@ -60,12 +59,12 @@ _SAMPLES, _REST = 4, 6
 _AROUND, _HARDLY = 12, 1e-3
 # A leaf takes part in a new group when so many of its points fit nothing, or one in so many.
 _LEFT_POINTS, _LEFT_SHARE = 2, 3
-# Samples for fitting a surface anew.
+# Samples for fitting a surface anew, and the fewest that are worth it.
 _REFIT, _FEWEST = 300, 10
-# ... and in the end, when it is settled which points are its own; of one leaf at most.
-_SETTLED, _DENSE = 600, 32
 # ... away from other surfaces, if there are so many of these.
 _INNER = 40
+# Samples when it is settled which points are its own, and of one leaf at most.
+_SETTLED, _DENSE = 600, 32
 _MERGES = 8
 # By how much the cost of a surface found late must be lower, in squares of noises.
 _HANDICAP = 2.0
@@ -302,6 +301,7 @@ class _Search:
         """Give up surfaces that their neighbours explain; say whether there were any."""
         off = runtime.download(self.labelling.choice.off)
         second = runtime.download(self.labelling.choice.second)
+        # What faces another way explains nothing.
         second = np.where(
             off[:, 1] * self.labelling.rule.tilt <= self.labelling.rule.turn, second, NONE
         )

@@ -9,12 +9,12 @@ import numpy as np
 from octoseg_ti.defaults import PIECE_GAPS
 from octoseg_ti.device import runtime
 from octoseg_ti.params import Params
-from octoseg_ti.patches import Regions
+from octoseg_ti.patches import Regions, relabelled
 from octoseg_ti.stages.extraction import Tolerance
 from octoseg_ti.stages.grid import Grid
-from octoseg_ti.stages.labelling import Labelling, Rule, common_label, label_lists, surface_table
+from octoseg_ti.stages.labelling import Labelling, Rule, label_lists, surface_table
 from octoseg_ti.stages.leaves import Leaves, leaf_graph, without_gaps
-from octoseg_ti.stages.merging import pieces
+from octoseg_ti.stages.merging import mean_squares, pieces
 from octoseg_ti.stages.settling import settle
 from octoseg_ti.surface_search import AROUND, EXPLAINED, FREE, NARROW, Surfaced, find_surfaces
 from octoseg_ti.types import NONE
@@ -22,8 +22,8 @@ from octoseg_ti.types import NONE
 # Positions are exact, and tell by themselves, where a surface needs no more than this share of the
 # points of a patch.
 _ALONE = 0.33
-# Distances beyond this many noises count as this many; whole units add up alike in any order.
-_CAP, _UNIT = 4.0, 1024.0
+# Distances beyond this many noises count as this many.
+_CAP = 4.0
 # A point that fits nothing joins a patch within so many times the usual reach.
 _LOOSE = 3.0
 
@@ -63,12 +63,8 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         # off. What is neither near nor faces that way is something else.
         label = _join(grid, graph, label, table, rule._replace(turn=float(np.pi)))
         label = _join(grid, graph, label, table, rule._replace(reach=_LOOSE * rule.reach))
-    held = np.full(grid.count, NONE, np.int32)
-    held[leaves] = common_label(graph, label)
-    return replace(
+    found = replace(
         found,
-        label=label,
-        cell_label=np.where(found.cell_label >= 0, held, NONE).astype(np.int32),
         count=len(surface) + free,
         surface=np.concatenate([surface, np.full(free, NONE, np.int32)]),
         kind=surfaced.surfaces.kind,
@@ -76,6 +72,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         covariance=surfaced.covariance,
         graph=graph,
     )
+    return relabelled(grid, leaves, found, label)
 
 
 def _join(
@@ -167,8 +164,8 @@ def number_pieces(
     main = np.zeros(len(size), bool)
     main[mine] = size[mine] == most[name]
     # Where surfaces touch smoothly one goes on within the other, and gets some of its points.
-    square = np.rint(_UNIT * np.minimum(found.off[there], _CAP) ** 2)
-    within = np.bincount(mine, square, len(size)) <= _UNIT * EXPLAINED * size
+    (square,) = mean_squares(mine, found.off[there], (_CAP,), size, np.zeros_like(size))
+    within = square <= EXPLAINED
     kept = size >= np.where(main, max(fewest, 1), max(least, 1))
     names = np.flatnonzero(kept & (main | ~within))
     names = names[np.argsort(-size[names], kind="stable")]

@@ -215,7 +215,8 @@ class Fillets:
     """The fillets of a part: strips that a ball leaves that rolls along two patches; ``F`` of them.
 
     The points of a strip keep the label that they have, that of a patch of their own where the
-    strip is wide enough to be one; `strip` tells which patches are strips. A corner where several
+    strip is wide enough to be one, up to the lines where the ball touches the sides; `strip` tells
+    which patches are strips. A corner where several
     fillets meet may be a fillet of its own, between one fillet and the next patch.
     """
 
@@ -270,8 +271,8 @@ class Segmentation:
     sphere: axis and b; cylinder, cone: b), and everywhere for a free form, no kind, or too few
     points.
 
-    To first order: s^2 (J'J)^-1 over the points that the surface was fitted to (at most a
-    thousand, evenly spread over all its patches, which share one covariance; all points of a plane
+    To first order: s^2 (J'J)^-1 over the points that the surface was fitted to (at most
+    600, evenly spread over all its patches, which share one covariance; all points of a plane
     found without the search for surfaces). s is what these points leave, not what was assumed; on
     exact data that is rounding. It takes their errors for independent. What neighbours share is not
     in it: errors of the poses, of the calibration, of a whole stripe or view, or of the form

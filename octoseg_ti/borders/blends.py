@@ -12,26 +12,12 @@ from octoseg_ti.borders.fillets import SLACK, WEAK, smooth_pairs, without_suppor
 from octoseg_ti.borders.zones import EDGE, Search, Zones, points_of
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.stages.marking import nearest_marked
-from octoseg_ti.types import NONE, EdgeClass, SurfaceKind
+from octoseg_ti.types import NONE, EdgeClass
 
 # A blend joins at least so many others smoothly, along this share of its border.
 _JOINED, _SHARE = 2, 0.5
 # Length of the mean of its normals: a quarter of a tube has 0.9, half a tube 0.64, a boss none.
 _OPEN = 0.7
-
-
-def ball_radii(search: Search) -> np.ndarray:
-    """Return the radius of the ball that touches every patch along a line [mm], shape (K,).
-
-    That of a cylinder, of a sphere, of the tube of a torus; infinite for other surfaces.
-    """
-    kind = search.table[:, 8].astype(np.int32)
-    radius = np.full(search.count, np.inf)
-    ball = (kind == int(SurfaceKind.CYLINDER)) | (kind == int(SurfaceKind.SPHERE))
-    ring = kind == int(SurfaceKind.TORUS)
-    radius[ball], radius[ring] = search.table[ball, 6], search.table[ring, 7]
-    radius[~search.analytic] = np.inf
-    return radius
 
 
 def find_blends(search: Search, zones: Zones, turn: np.ndarray) -> np.ndarray:
@@ -42,7 +28,7 @@ def find_blends(search: Search, zones: Zones, turn: np.ndarray) -> np.ndarray:
         zones: The pairs of patches.
         turn: Mean angle by which the surface turns over the edge of every pair [rad], shape (P,).
     """
-    small = ball_radii(search) <= SLACK * search.limit
+    small = search.ball_radii() <= SLACK * search.limit
     smooth = smooth_pairs(search, zones.pairs, turn)
     sides = zones.pairs.T.ravel()
     joined = np.bincount(sides, np.tile(smooth & (zones.contact > 0), 2), search.count)
@@ -77,7 +63,7 @@ def mark_blends(
     mine = mine[blend[search.label[mine]]]
     mark[mine] = search.label[mine]
     # A surface that touches another lies on it for a while beyond the end of its patch.
-    radius, weak = ball_radii(search), np.zeros(len(search.label), bool)
+    radius, weak = search.ball_radii(), np.zeros(len(search.label), bool)
     kind = search.table[:, 8].astype(np.int32)
     for patch, beside in np.concatenate([zones.pairs[smooth], zones.pairs[smooth, ::-1]]):
         if blend[patch]:

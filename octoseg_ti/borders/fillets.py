@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from octoseg_ti.borders.zones import CAP, Search, Zones, listed, points_of, thinned
+from octoseg_ti.borders.zones import CAP, Search, Zones, listed, points_of, tasks, thinned
 from octoseg_ti.stages.leaves import Samples
 from octoseg_ti.stages.marking import nearest_marked
 from octoseg_ti.stages.profiles import BALL, NOWHERE
@@ -196,13 +196,6 @@ def fit_balls(
     )
 
 
-def tasks(pairs: np.ndarray, pair: np.ndarray) -> np.ndarray:
-    """Return both surfaces of every pair and the range of its entries, shape (P, 4)."""
-    total = np.bincount(pair, minlength=len(pairs))
-    ends = np.cumsum(total)
-    return np.column_stack([pairs, ends - total, ends])
-
-
 def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
     """Let balls claim the points on them, the best supported first; say which remain, (P,) bool."""
     point, pair = points_of(search, zones, fit.good)
@@ -327,13 +320,8 @@ def strips_of(search: Search, number: np.ndarray) -> np.ndarray:
 
 def smooth_pairs(search: Search, pairs: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """Say which pairs of surfaces meet without an angle, as far as their errors tell, (P,) bool."""
-    kind = search.table[:, 8].astype(np.int32)
-    curved = np.full(search.count, np.inf)
-    ball = (kind == int(SurfaceKind.CYLINDER)) | (kind == int(SurfaceKind.SPHERE))
-    ring = kind == int(SurfaceKind.TORUS)
-    curved[ball], curved[ring] = search.table[ball, 6], search.table[ring, 7]
     # An error of place as large as the noise opens a tangent joint by this angle.
-    radius = np.maximum(curved[pairs].min(axis=1), 1e-9)
+    radius = np.maximum(search.ball_radii()[pairs].min(axis=1), 1e-9)
     open_ = np.maximum(_SMOOTH, np.sqrt(4.0 * search.noise / radius))
-    flat = (kind[pairs] == int(SurfaceKind.PLANE)).all(axis=1)
+    flat = (search.table[pairs, 8] == int(SurfaceKind.PLANE)).all(axis=1)
     return ~flat & (turn < open_)

@@ -14,10 +14,10 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.stages.extraction import Surfaces
 from octoseg_ti.stages.labelling import label_lists, near_lists
-from octoseg_ti.stages.leaves import Leaves, members_of
+from octoseg_ti.stages.leaves import Leaves, leaf_boxes, members_of
 from octoseg_ti.stages.profiles import BALL, NOWHERE, Places, place, sums
 from octoseg_ti.stages.sets import spread
-from octoseg_ti.types import NONE
+from octoseg_ti.types import NONE, SurfaceKind
 
 CAP = 4.0
 """Distances beyond this many noises count as this many."""
@@ -116,13 +116,7 @@ class Search:
         self.own = label_lists(leaves, label)
         self.near = near_lists(leaves, self.own)
         self.claim = np.full(len(label), NONE, np.int32)
-        self.box = np.concatenate(
-            [
-                np.minimum.reduceat(self.points, leaves.first),
-                np.maximum.reduceat(self.points, leaves.first),
-            ],
-            axis=1,
-        )
+        self.box = leaf_boxes(self.points, leaves)
 
     def leaf_of(self, point: np.ndarray) -> np.ndarray:
         """Return the leaves that hold some points, shape (E,)."""
@@ -177,6 +171,18 @@ class Search:
         off = self.off[self.label >= 0]
         return float(np.sqrt(np.mean(off**2))) if len(off) else self.noise
 
+    def ball_radii(self) -> np.ndarray:
+        """Return the radius of the ball that touches every patch along a line [mm], shape (K,).
+
+        That of a cylinder, of a sphere, of the tube of a torus; infinite for other surfaces.
+        """
+        kind = np.where(self.analytic, self.table[:, 8], int(SurfaceKind.FREE_FORM))
+        radius = np.full(self.count, np.inf)
+        ball = (kind == int(SurfaceKind.CYLINDER)) | (kind == int(SurfaceKind.SPHERE))
+        ring = kind == int(SurfaceKind.TORUS)
+        radius[ball], radius[ring] = self.table[ball, 6], self.table[ring, 7]
+        return radius
+
     def radii(self, ratio: float) -> np.ndarray:
         """Return the radii that are tried, each larger than the last by this ratio."""
         least = _LEAST * self.spacing
@@ -209,6 +215,13 @@ def ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
     ends = np.cumsum(count, dtype=np.int64)
     total = int(ends[-1]) if len(ends) else 0
     return np.arange(total) + np.repeat(first - (ends - count), count)
+
+
+def tasks(pairs: np.ndarray, pair: np.ndarray) -> np.ndarray:
+    """Return both surfaces of every pair and the range of its entries, shape (P, 4)."""
+    total = np.bincount(pair, minlength=len(pairs))
+    ends = np.cumsum(total)
+    return np.column_stack([pairs, ends - total, ends])
 
 
 def thinned(owner: np.ndarray, pairs: int, most: int) -> np.ndarray:
@@ -262,11 +275,8 @@ def strips_between(search: Search, touching: np.ndarray) -> np.ndarray:
     hollow = np.where(height[kept] < 0.0, -1.0, 1.0)
     if len(triple) == 0:
         return triple
-    total = np.bincount(owner, minlength=len(triple))
-    ends = np.cumsum(total)
-    task = np.column_stack([triple[:, 1:], ends - total, ends])
     radii = search.radii(_RATIO)
-    cost, on = search.tried(task, radii, hollow, entry)
+    cost, on = search.tried(tasks(triple[:, 1:], owner), radii, hollow, entry)
     best = (on - cost).argmax(axis=1)
     at = search.place(triple[:, 1:], hollow * radii[best], entry, owner)
     between = np.bincount(owner, at.region == BALL, len(triple))

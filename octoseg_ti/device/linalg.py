@@ -1,4 +1,4 @@
-"""Small linear algebra for kernels: eigenvalues and eigenvectors of symmetric 3x3 matrices."""
+"""Small linear algebra for kernels: rows, boxes, eigenvectors of symmetric 3x3 matrices."""
 
 from octoseg_ti.device.runtime import ti
 
@@ -13,6 +13,16 @@ _SWEEPS = 12
 def row(rows: ti.template(), i: ti.i32) -> vec3:
     """Return row ``i`` of an array of shape (n, 3)."""
     return vec3(rows[i, 0], rows[i, 1], rows[i, 2])
+
+
+@ti.func
+def box_gap(box_in: ti.template(), b: ti.i32, p: ti.template()) -> ti.f64:
+    """Return the squared distance from a place to box ``b``: lower and upper corner in a row."""
+    gap = 0.0
+    for k in ti.static(range(3)):
+        off = ti.max(box_in[b, k] - p[k], p[k] - box_in[b, 3 + k], 0.0)
+        gap += off * off
+    return gap
 
 
 @ti.func

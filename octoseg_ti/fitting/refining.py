@@ -4,9 +4,7 @@ import numpy as np
 
 from octoseg_ti.device.surfaces import KINDS, evaluate_surfaces
 from octoseg_ti.fitting.covariance import WAYS, distance_gradient, padded, ways_of
-
-TUKEY = 4.685
-"""The weight of a point ends at so many deviations (Tukey's biweight)."""
+from octoseg_ti.fitting.primitives import TUKEY
 
 _DAMPING = 1e-9  # of the squares of the columns: what no point holds stays where it is
 _LEAST = 1e-12

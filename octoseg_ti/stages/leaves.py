@@ -162,6 +162,18 @@ def _linked(
     )
 
 
+def leaf_boxes(points: np.ndarray, leaves: Leaves) -> np.ndarray:
+    """Return the lower and upper corner of the points of every leaf [mm], shape (C, 6).
+
+    Args:
+        points: Sorted positions [mm], shape (n, 3), f64.
+        leaves: The leaves.
+    """
+    low = np.minimum.reduceat(points, leaves.first, axis=0)
+    high = np.maximum.reduceat(points, leaves.first, axis=0)
+    return np.concatenate([low, high], axis=1)
+
+
 def without_gaps(grid: Grid, leaves: Leaves, gap: float) -> Leaves:
     """Return the leaves without the pairs whose points are far apart, though the boxes touch.
 
@@ -173,9 +185,8 @@ def without_gaps(grid: Grid, leaves: Leaves, gap: float) -> Leaves:
     wide = np.flatnonzero(leaves.size[leaves.a] + leaves.size[leaves.b] > gap)
     if len(wide) == 0:
         return leaves
-    point = runtime.download(grid.point)
-    low = np.minimum.reduceat(point, leaves.first, axis=0)
-    high = np.maximum.reduceat(point, leaves.first, axis=0)
+    box = leaf_boxes(runtime.download(grid.point), leaves)
+    low, high = box[:, :3], box[:, 3:]
     a, b = leaves.a[wide], leaves.b[wide]
     apart = np.maximum(np.maximum(low[a] - high[b], low[b] - high[a]), 0.0)
     kept = np.ones(len(leaves.a), bool)

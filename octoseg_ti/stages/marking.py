@@ -3,7 +3,7 @@
 import numpy as np
 
 from octoseg_ti.device import runtime
-from octoseg_ti.device.linalg import row
+from octoseg_ti.device.linalg import box_gap, row
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.stages.leaves import Leaves
 
@@ -13,23 +13,14 @@ _ASIDE = 2.25
 
 
 @ti.func
-def _gap(point_in: ti.template(), box_in: ti.template(), c: ti.i32, i: ti.i32) -> ti.f64:
-    """Return the squared distance from point i to the box of leaf c."""
-    gap = 0.0
-    for k in ti.static(range(3)):
-        off = ti.max(box_in[c, k] - point_in[i, k], point_in[i, k] - box_in[c, 3 + k], 0.0)
-        gap += off * off
-    return gap
-
-
-@ti.func
 def _in_leaf(
     point_in: ti.template(), mark_in: ti.template(), leaf_in: ti.template(), box_in: ti.template(),
     c: ti.i32, i: ti.i32, wanted: ti.i32, limit: ti.f64,
 ):  # fmt: skip
     """Return the least squared distance from point i to a point of leaf c with the mark."""
     least = limit
-    if _gap(point_in, box_in, c, i) < limit and leaf_in[c, 2] <= wanted and wanted <= leaf_in[c, 3]:
+    held = leaf_in[c, 2] <= wanted and wanted <= leaf_in[c, 3]
+    if held and box_gap(box_in, c, row(point_in, i)) < limit:
         for j in range(leaf_in[c, 0], leaf_in[c, 0] + leaf_in[c, 1]):
             if mark_in[j] == wanted and j != i:
                 least = ti.min(least, (row(point_in, j) - row(point_in, i)).norm_sqr())
@@ -70,7 +61,7 @@ def _nearest(
         while k < start_in[c + 1] and least >= reach:
             b = neighbor_in[k]
             j = start_in[b]
-            if _gap(point_in, box_in, b, i) > _ASIDE * reach:
+            if box_gap(box_in, b, row(point_in, i)) > _ASIDE * reach:
                 j = start_in[b + 1]
             while j < start_in[b + 1] and least >= reach:
                 least = _in_leaf(

@@ -185,8 +185,8 @@ def explained_by_others(
     mine, other, near = label[here], second[here], off[here]
     size = np.bincount(label[label >= 0], minlength=count)
     alone = size - np.bincount(mine, minlength=count)
-    far, deviation = _mean_squares(mine, near[:, 0], (_CAP, 2.0 * _FORM), size, alone)
-    (turn,) = _mean_squares(mine, near[:, 1], (2.0 * _SMOOTH,), size, alone)
+    far, deviation = mean_squares(mine, near[:, 0], (_CAP, 2.0 * _FORM), size, alone)
+    (turn,) = mean_squares(mine, near[:, 1], (2.0 * _SMOOTH,), size, alone)
     given_up = np.zeros(count, bool)
     leaned_on = np.zeros(count, bool)
     pair, points = _pairs(mine, other, alone, count)
@@ -245,7 +245,7 @@ def _pairs(
     return pair[total > 0], total[total > 0]
 
 
-def _mean_squares(
+def mean_squares(
     owner: np.ndarray,
     value: np.ndarray,
     caps: tuple[float, ...],
@@ -254,7 +254,15 @@ def _mean_squares(
 ) -> list[np.ndarray]:
     """Return the mean square of the values of every owner, no value above the cap, for every cap.
 
-    Points that are ``alone`` count with the cap.
+    Args:
+        owner: Owner of every value, shape (k,), i32.
+        value: The values, shape (k,).
+        caps: The caps.
+        size: How many every owner has, those that are ``alone`` with them, shape (M,).
+        alone: How many of these have no value, and count with the cap, shape (M,).
+
+    Returns:
+        Shape (M,) for every cap; the same in whatever order the values come.
     """
     square = np.rint(_UNIT * value.astype(np.float64) ** 2)  # whole units add up alike in any order
     means = []

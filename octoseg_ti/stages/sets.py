@@ -62,7 +62,7 @@ def joined(surfaces: list[Surfaces]) -> Surfaces:
 
 
 @ti.kernel
-def _lie_on(
+def _measure_nearness(
     limit: ti.f64,
     cosine: ti.f64,
     # In:
@@ -125,8 +125,9 @@ def nearness(
         turn: Largest angle between the normals [rad].
 
     Returns:
-        1 less the square of the distance in limits, and 0 where a sample does not lie on the
-        surface: an array of f32 for every surface.
+        An array of f32 for every surface: 1 less the square of the distance in limits, times 1 less
+        the share that the angle between the normals has of the largest one (by their cosines; 1
+        without a normal); and 0 where a sample does not lie on the surface.
     """
     runtime.ensure_started()
     if len(surfaces) == 0:
@@ -136,7 +137,7 @@ def nearness(
     out = np.cumsum(length[which]) - length[which]
     ranges = np.stack([begin[which], begin[which] + length[which], out], axis=1).astype(np.int32)
     near = runtime.empty(int(length[which].sum()), np.float32)
-    _lie_on(
+    _measure_nearness(
         limit,
         float(np.cos(min(turn, np.pi / 2))),
         runtime.upload(samples.point),

@@ -16,28 +16,17 @@ from typing import Any
 import numpy as np
 
 from octoseg_ti.device import runtime
-from octoseg_ti.device.linalg import row, vec3
+from octoseg_ti.device.linalg import box_gap, row, vec3
 from octoseg_ti.device.runtime import F32Rows, F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.surfaces import surface_in_row
-from octoseg_ti.stages.leaves import Leaves
+from octoseg_ti.stages.leaves import Leaves, leaf_boxes
 from octoseg_ti.types import SurfaceKind
 
 DOUBT = 9.0
 """A choice is beyond doubt when the next surface costs this much more: three deviations."""
 
-
 _ACROSS = 0.35  # surfaces that meet at a larger angle [rad] cross; so do all planes
 _PLANE = int(SurfaceKind.PLANE)
-
-
-@ti.func
-def _box_gap(box_in: ti.template(), c: ti.i32, p: vec3) -> ti.f64:
-    """Return the squared distance from a place to the box of leaf c."""
-    gap = 0.0
-    for k in ti.static(range(3)):
-        off = ti.max(box_in[c, k] - p[k], p[k] - box_in[c, 3 + k], 0.0)
-        gap += off * off
-    return gap
 
 
 @ti.func
@@ -112,7 +101,7 @@ def _settle(
                         d = c
                         if k >= link_in[c, 2]:
                             d = neighbor_in[k]
-                        if _box_gap(box_in, d, p) < reach * reach:
+                        if box_gap(box_in, d, p) < reach * reach:
                             leaf = ti.Vector([link_in[d, 0], link_in[d, 1]])
                             told += _ask(
                                 leaf, surface_in, label_in, second_in, off_in, point_in,
@@ -157,10 +146,7 @@ def settle(
     if len(surfaces) == 0:
         return runtime.download(label)
     settled = runtime.empty(label.shape[0], np.int32)
-    place = runtime.download(points)
-    box = np.concatenate(
-        [np.minimum.reduceat(place, leaves.first), np.maximum.reduceat(place, leaves.first)], axis=1
-    )
+    box = leaf_boxes(runtime.download(points), leaves)
     link = np.stack(
         [leaves.first, leaves.first + leaves.count, leaves.start[:-1], leaves.start[1:]], axis=1
     )

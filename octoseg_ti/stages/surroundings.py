@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from octoseg_ti.device import runtime
-from octoseg_ti.device.linalg import row, vec3
+from octoseg_ti.device.linalg import box_gap, row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.stages.leaves import Leaves
 
@@ -43,16 +43,6 @@ def _bound_blocks(
 
 
 @ti.func
-def _apart(p: vec3, box_in: ti.template(), c: ti.i32) -> ti.f64:
-    """Return the squared distance from a point to a box."""
-    apart = 0.0
-    for k in ti.static(range(3)):
-        off = ti.max(box_in[c, k] - p[k], p[k] - box_in[c, 3 + k], 0.0)
-        apart += off * off
-    return apart
-
-
-@ti.func
 def _occupied(
     point_in: ti.template(), leaf_in: ti.template(), block_in: ti.template(), c: ti.i32, p: vec3,
     u: vec3, v: vec3, square: ti.f64,
@@ -62,7 +52,7 @@ def _occupied(
     begin = leaf_in[c, 0]
     end = begin + leaf_in[c, 1]
     for b in range(begin // BLOCK, (end - 1) // BLOCK + 1):
-        if _apart(p, block_in, b) <= square:
+        if box_gap(block_in, b, p) <= square:
             for j in range(ti.max(begin, b * BLOCK), ti.min(end, (b + 1) * BLOCK)):
                 step = row(point_in, j) - p
                 far = step.norm_sqr()
@@ -126,12 +116,12 @@ def _free_sectors(
                 end = begin
             for k in range(begin, end):
                 b = neighbor_in[k]
-                if _apart(p, box_in, b) <= square:
+                if box_gap(box_in, b, p) <= square:
                     if ring == 0:
                         held |= _occupied(point_in, leaf_in, block_in, b, p, u, v, square)
                     elif leaf_in[b, 2] == 1:
                         for j in range(start_in[b], start_in[b + 1]):
-                            if _apart(p, box_in, neighbor_in[j]) <= square:
+                            if box_gap(box_in, neighbor_in[j], p) <= square:
                                 held |= _occupied(
                                     point_in, leaf_in, block_in, neighbor_in[j], p, u, v, square
                                 )
@@ -153,7 +143,7 @@ def _mark_leaf(
     begin = leaf_in[c, 0]
     end = begin + leaf_in[c, 1]
     for b in range(begin // BLOCK, (end - 1) // BLOCK + 1):
-        if _apart(p, block_in, b) <= square:
+        if box_gap(block_in, b, p) <= square:
             for j in range(ti.max(begin, b * BLOCK), ti.min(end, (b + 1) * BLOCK)):
                 if (row(point_in, j) - p).norm_sqr() <= square and label_in[j] == label_in[i]:
                     near_out[j] = 1
@@ -183,10 +173,10 @@ def _spread(
         _mark_leaf(point_in, label_in, leaf_in, block_in, c, i, square, near_out)
         for k in range(start_in[c], start_in[c + 1]):
             b = neighbor_in[k]
-            if _apart(p, box_in, b) <= square:
+            if box_gap(box_in, b, p) <= square:
                 _mark_leaf(point_in, label_in, leaf_in, block_in, b, i, square, near_out)
                 for j in range(start_in[b], start_in[b + 1]):
-                    if leaf_in[b, 2] == 1 and _apart(p, box_in, neighbor_in[j]) <= square:
+                    if leaf_in[b, 2] == 1 and box_gap(box_in, neighbor_in[j], p) <= square:
                         _mark_leaf(
                             point_in, label_in, leaf_in, block_in, neighbor_in[j], i, square,
                             near_out,

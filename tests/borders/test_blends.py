@@ -8,8 +8,8 @@ from reference.leaves import leaves_of
 from reference.rounded import rounded_block
 
 from octoseg_ti import evaluate, segment
-from octoseg_ti.borders.blends import ball_radii, find_blends, mark_blends
-from octoseg_ti.borders.zones import Zones
+from octoseg_ti.borders.blends import find_blends, mark_blends
+from octoseg_ti.borders.zones import Search, Zones
 from octoseg_ti.device import runtime
 from octoseg_ti.types import EdgeClass, SurfaceKind
 from scanner_sim import StripeScanner, simulate
@@ -19,12 +19,19 @@ PLANE, CYLINDER, SPHERE, TORUS = (
 )
 
 
+class Searched(SimpleNamespace):
+    """What the functions here need of a `Search`."""
+
+    ball_radii = Search.ball_radii
+    leaf_of = Search.leaf_of
+
+
 def surface(kind: int, first: float = 0.0, second: float = 0.0) -> np.ndarray:
     return np.array([0, 0, 0, 0, 0, 1, first, second, kind, 1.0])
 
 
-def searched(table: list[np.ndarray], normals: list[np.ndarray]) -> SimpleNamespace:
-    return SimpleNamespace(
+def searched(table: list[np.ndarray], normals: list[np.ndarray]) -> Searched:
+    return Searched(
         table=np.array(table),
         analytic=np.ones(len(table), bool),
         count=len(table),
@@ -49,9 +56,9 @@ def arc(degrees: float) -> np.ndarray:
 def test_the_ball_of_a_surface() -> None:
     table = [surface(PLANE), surface(CYLINDER, 2.0), surface(SPHERE, 1.5), surface(TORUS, 9.0, 0.7)]
     search = searched(table, [arc(90)] * 4)
-    np.testing.assert_array_equal(ball_radii(search), [np.inf, 2.0, 1.5, 0.7])  # type: ignore[arg-type]
+    np.testing.assert_array_equal(search.ball_radii(), [np.inf, 2.0, 1.5, 0.7])
     search.analytic[1] = False
-    assert np.isinf(ball_radii(search)[1])  # type: ignore[arg-type]
+    assert np.isinf(search.ball_radii()[1])
 
 
 @pytest.mark.parametrize(
@@ -95,7 +102,7 @@ def test_points_beside_a_blend_are_marked_and_stray_ones_are_not() -> None:
     table[0, :6] = (0, 0, 3, 0, 0, 1)
     table[1, :6] = (5, 0, 2, 0, 1, 0)
     cells = np.arange(len(leaves))
-    search = SimpleNamespace(
+    search = Searched(
         table=table,
         analytic=np.ones(2, bool),
         count=2,
@@ -107,7 +114,6 @@ def test_points_beside_a_blend_are_marked_and_stray_ones_are_not() -> None:
         leaves=leaves,
         box=box,
         device=(runtime.upload(points),),
-        leaf_of=lambda point: np.searchsorted(leaves.first, point, side="right") - 1,
     )
     zones = Zones(
         np.array([[0, 1]]), 0 * cells, cells, cells >= 0, np.array([0, 1]), 3, np.array([9])

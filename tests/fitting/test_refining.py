@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from reference.surfaces import CONE, CYLINDER, PLANE, SPHERE, TORUS, distance_of, patch_of
 
-from octoseg_ti.fitting.refining import TUKEY, refine
+from octoseg_ti.fitting.primitives import TUKEY
+from octoseg_ti.fitting.refining import refine
 
 KINDS = (PLANE, CYLINDER, CONE, SPHERE, TORUS)
 
