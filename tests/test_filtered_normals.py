@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import make_tent
+from reference.tent import make_tent
 
 from octoseg_ti import Params, Scans, Truth, paper, segment
 from octoseg_ti.defaults import LEAST_TOLERANCE, NOISE_FLOORS, SMOOTH_PASSES, passes_for

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import make_tent
 from reference.clouds import rotation
+from reference.tent import make_tent
 
 from octoseg_ti import Params, Scans, evaluate, paper, segment
 from octoseg_ti.device.profiling import Trace

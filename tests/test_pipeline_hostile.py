@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import make_tent
+from reference.tent import make_tent
 
 from octoseg_ti import DataError, Params, Scans, Segmentation, paper, segment
 from octoseg_ti.params import PRESETS, GridParams
