@@ -33,7 +33,7 @@ from octoseg_ti.fitting.motions import (
 )
 
 _SOME = 100  # points that the first passes look at
-_PATIENCE = 3  # passes before a kind may be left
+_PATIENCE, _AGAIN = 4, 2  # passes until it is seen which kinds may be left, and until the next time
 _LEAVE = 4.0  # a kind that is so many times worse than another, in mean square, may be left
 _REST = 0.02  # the gain of a step, in variances of a point, that moves nothing worth telling
 _EXACT = 1e-26  # mean square distance, in extents, that is rounding
@@ -67,67 +67,58 @@ def _shape(kind: ti.i32, work: ti.template(), t: ti.i32, at: ti.i32) -> vec4:
     return shape
 
 
-@ti.kernel
+@ti.func
 def _linearise(
-    tasks: ti.i32,
-    stride: ti.i32,
-    # In:
-    task_in: I32Array,
-    point_in: F64Rows,
-    weight_in: F64Array,
-    start_in: I32Array,
-    every_in: I32Array,
-    frame_in: F64Rows,
-    reach_in: F64Array,
-    # Out:
-    work_inout: F64Rows,
+    t: ti.i32,
+    every: ti.i32,
+    points: ti.template(),
+    weights: ti.template(),
+    starts: ti.template(),
+    frames: ti.template(),
+    reach: ti.f64,
+    work: ti.template(),
 ):
-    """Write cost, gradient and normal equations of the state on trial of every task listed.
+    """Write cost, gradient and normal equations of the state on trial.
 
     The reach is where the weight of a point ends (Tukey's biweight); infinite = least squares.
     """
-    for e in range(tasks * stride):
-        if e % stride == 0 and work_inout[task_in[e // stride], _BLOCK + _COST] < 1e300:
-            t = task_in[e // stride]
-            kind = t % KINDS
-            g = t // KINDS
-            origin = _triple(work_inout, t, _BLOCK)
-            axis = _triple(work_inout, t, _BLOCK + 3)
-            u = _triple(work_inout, t, _BLOCK + 6)
-            shape = _shape(kind, work_inout, t, _BLOCK)
-            anchor = anchor_radius(kind, origin, axis, shape)
-            scale = frame_in[g, 3]
-            origin = row(frame_in, g) + origin / scale
-            axis = scale * axis
-            v = axis.cross(u)
-            u = scale * u
-            reach = reach_in[t]
-            every = every_in[g]
-            cost = 0.0
-            gradient = vec7(0.0)
-            normal = vec28(0.0)
-            for k in range((start_in[g + 1] - start_in[g] + every - 1) // every):
-                i = start_in[g] + k * every
-                p = row(point_in, i) - origin
-                local = vec3(p.dot(u), p.dot(v), p.dot(axis))
-                d, j = change_of_distance(kind, local, shape, anchor)
-                w = weight_in[i]
-                if reach < 1e300:
-                    left = ti.max(1.0 - d * d / (reach * reach), 0.0)
-                    cost += w * reach * reach * (1.0 - left * left * left) / 3.0
-                    w *= left * left
-                else:
-                    cost += w * d * d
-                gradient += (w * d) * j
-                for a in ti.static(range(7)):
-                    wj = w * j[a]
-                    for b in ti.static(range(a + 1)):
-                        normal[a * (a + 1) // 2 + b] += wj * j[b]
-            work_inout[t, _BLOCK + _COST] = cost
-            for a in ti.static(range(7)):
-                work_inout[t, _BLOCK + _GRADIENT + a] = gradient[a]
-            for a in ti.static(range(28)):
-                work_inout[t, _BLOCK + _NORMAL + a] = normal[a]
+    kind = t % KINDS
+    g = t // KINDS
+    origin = _triple(work, t, _BLOCK)
+    axis = _triple(work, t, _BLOCK + 3)
+    u = _triple(work, t, _BLOCK + 6)
+    shape = _shape(kind, work, t, _BLOCK)
+    anchor = anchor_radius(kind, origin, axis, shape)
+    scale = frames[g, 3]
+    origin = row(frames, g) + origin / scale
+    axis = scale * axis
+    v = axis.cross(u)
+    u = scale * u
+    cost = 0.0
+    gradient = vec7(0.0)
+    normal = vec28(0.0)
+    for k in range((starts[g + 1] - starts[g] + every - 1) // every):
+        i = starts[g] + k * every
+        p = row(points, i) - origin
+        local = vec3(p.dot(u), p.dot(v), p.dot(axis))
+        d, j = change_of_distance(kind, local, shape, anchor)
+        w = weights[i]
+        if reach < 1e300:
+            left = ti.max(1.0 - d * d / (reach * reach), 0.0)
+            cost += w * reach * reach * (1.0 - left * left * left) / 3.0
+            w *= left * left
+        else:
+            cost += w * d * d
+        gradient += (w * d) * j
+        for a in ti.static(range(7)):
+            wj = w * j[a]
+            for b in ti.static(range(a + 1)):
+                normal[a * (a + 1) // 2 + b] += wj * j[b]
+    work[t, _BLOCK + _COST] = cost
+    for a in ti.static(range(7)):
+        work[t, _BLOCK + _GRADIENT + a] = gradient[a]
+    for a in ti.static(range(28)):
+        work[t, _BLOCK + _NORMAL + a] = normal[a]
 
 
 @ti.func
@@ -195,37 +186,63 @@ def _try_step(kind: ti.i32, work: ti.template(), t: ti.i32):
         work[t, _BLOCK + _COST] = ti.math.inf
 
 
+@ti.func
+def _keep_better(work: ti.template(), t: ti.i32):
+    """Keep the state on trial if it is better than the best; note what it gained."""
+    before = work[t, _COST]
+    after = work[t, _BLOCK + _COST]
+    damping = work[t, _DAMPING]
+    gain = 1.0
+    if after <= before:
+        for c in range(_BLOCK):
+            work[t, c] = work[t, _BLOCK + c]
+        damping = ti.max(0.1 * damping, 1e-12)
+        if before < 1e300:
+            gain = (before - after) / ti.max(before, 1e-300)
+    else:
+        damping *= 10.0
+    if damping > _WORST:
+        gain = 0.0
+    work[t, _DAMPING] = damping
+    work[t, _GAIN] = gain
+
+
 @ti.kernel
-def _step(
+def _descend(
     tasks: ti.i32,
     stride: ti.i32,
+    rounds: ti.i32,
     # In:
     task_in: I32Array,
+    point_in: F64Rows,
+    weight_in: F64Array,
+    start_in: I32Array,
+    every_in: I32Array,
+    frame_in: F64Rows,
+    reach_in: F64Array,
     # Out:
     work_inout: F64Rows,
 ):
-    """Keep the state on trial if it is better, and step on from the best; note what it gained."""
+    """Let every task listed take so many steps, or fewer where it comes to rest."""
     for e in range(tasks * stride):
         if e % stride == 0:
             t = task_in[e // stride]
-            before = work_inout[t, _COST]
-            after = work_inout[t, _BLOCK + _COST]
-            damping = work_inout[t, _DAMPING]
-            gain = 1.0
-            if after <= before:
-                for c in range(_BLOCK):
-                    work_inout[t, c] = work_inout[t, _BLOCK + c]
-                damping = ti.max(0.1 * damping, 1e-12)
-                if before < 1e300:
-                    gain = (before - after) / ti.max(before, 1e-300)
-            else:
-                damping *= 10.0
-            if damping > _WORST:
-                gain = 0.0
-            work_inout[t, _DAMPING] = damping
-            work_inout[t, _GAIN] = gain
-            _solve_step(t % KINDS, damping, work_inout, t)
-            _try_step(t % KINDS, work_inout, t)
+            g = t // KINDS
+            every = every_in[g]
+            seen = (start_in[g + 1] - start_in[g] + every - 1) // every
+            most = rounds
+            if t % KINDS == PLANE and reach_in[t] >= 1e300:
+                most = 1  # its start is the solution
+            for _ in range(most):
+                if work_inout[t, _BLOCK + _COST] < 1e300:
+                    _linearise(
+                        t, every, point_in, weight_in, start_in, frame_in, reach_in[t], work_inout
+                    )
+                _keep_better(work_inout, t)
+                _solve_step(t % KINDS, work_inout[t, _DAMPING], work_inout, t)
+                _try_step(t % KINDS, work_inout, t)
+                if work_inout[t, _GAIN] * seen <= _REST or work_inout[t, _COST] <= _EXACT * seen:
+                    break
 
 
 def _contained(cost: np.ndarray) -> np.ndarray:
@@ -269,29 +286,27 @@ class _Run:
         self.work[:, _COST] = np.where(self.going.ravel(), np.inf, self.work[:, _COST])
         self.work[:, _DAMPING] = _DAMPING_START
         going = self.going.copy()
+        going[:, PLANE] &= self.robust  # else its start is the solution
         device, stride = runtime.upload(self.work), runtime.workers()[1]
         points, weight, start, frame, reach = self.data
         data = points, weight, start, runtime.upload(every), frame, reach
         seen = (-(-self.count // every))[:, None]
-        for k in range(rounds):
-            active = np.flatnonzero(going).astype(np.int32)
-            if len(active) == 0:
-                break
-            listed = runtime.upload(active)
-            _linearise(len(active), stride, listed, *data, device)
-            _step(len(active), stride, listed, device)
+        active = np.flatnonzero(self.going).astype(np.int32)
+        passes = _PATIENCE if self.leave else rounds
+        while len(active) and rounds > 0:
+            passes = min(passes, rounds)
+            _descend(len(active), stride, passes, runtime.upload(active), *data, device)
             self.work = runtime.download(device)[: self.groups * KINDS]
             cost, gain = self.cost, self.work[:, _GAIN].reshape(self.groups, KINDS)
-            rest = (gain * seen <= _REST) | (cost <= _EXACT * seen)
-            if k >= _PATIENCE and self.leave:
-                slow = gain < 0.1
+            going &= (gain * seen > _REST) & (cost > _EXACT * seen)
+            if self.leave:
                 worse = cost > _LEAVE * cost.min(axis=1, keepdims=True)
-                left = slow & (worse | (cost >= _contained(cost)))
+                left = (gain < 0.1) & (worse | (cost >= _contained(cost)))
                 left[:, PLANE] = False
                 self.going &= ~left
-                rest |= left
-            going &= ~rest
-            going[:, PLANE] &= self.robust  # else its start is the solution
+                going &= ~left
+            rounds, passes = rounds - passes, _AGAIN
+            active = np.flatnonzero(going).astype(np.int32)
 
 
 def iterate(
