@@ -318,6 +318,7 @@ def iterate(
     state: np.ndarray,
     *,
     rounds: int,
+    thin: bool = True,
     whole: bool = True,
     leave: bool = True,
 ) -> np.ndarray:
@@ -336,7 +337,8 @@ def iterate(
         state: Where to start, shape (T, G, KINDS, STATE): the first try, and others for what may
             come to rest in a wrong place; NaN = none.
         rounds: Most passes over the points, of either sort.
-        whole: Look at all the points in the end, not just at some.
+        thin: Look at some of the points first, where there are many.
+        whole: Look at all the points in the end.
         leave: Leave kinds that fall behind; not for a robust fit, as outliers favour some kinds.
 
     Returns:
@@ -349,7 +351,7 @@ def iterate(
     robust = bool(np.isfinite(flat).any())
     run = _Run(data, state[0], count, robust, leave)
     every = np.maximum(count // _SOME, 1).astype(np.int32)
-    if np.any(every > 1) or len(state) > 1 or not whole:
+    if thin and (np.any(every > 1) or len(state) > 1 or not whole):
         run.improve(every, rounds)
     for again in state[1:]:
         other = _Run(data, again, count, robust, False)

@@ -7,10 +7,18 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, ti
-from octoseg_ti.device.surfaces import CONE, CYLINDER, KINDS, SPHERE, TORUS, surface_in_row
+from octoseg_ti.device.surfaces import (
+    CONE,
+    CYLINDER,
+    KINDS,
+    PLANE,
+    SPHERE,
+    TORUS,
+    surface_in_row,
+)
 from octoseg_ti.fitting.descent import iterate
-from octoseg_ti.fitting.motions import FREE
-from octoseg_ti.fitting.starts import gather_moments, starts
+from octoseg_ti.fitting.motions import FREE, STATE
+from octoseg_ti.fitting.starts import gather_moments, starts, with_directions
 
 FREEDOM = FREE.sum(axis=1)
 """Degrees of freedom of every kind."""
@@ -155,6 +163,39 @@ def to_parameters(state: np.ndarray, centre: np.ndarray, extent: np.ndarray) -> 
         parameters[:, kind, 6] = extent * state[:, kind, 9]
     parameters[:, TORUS, 7] = extent * state[:, TORUS, 10]
     return parameters
+
+
+def to_states(
+    kind: np.ndarray, parameters: np.ndarray, centre: np.ndarray, extent: np.ndarray
+) -> np.ndarray:
+    """Return surfaces as states of their kinds: `to_parameters` the other way round.
+
+    Args:
+        kind: `SurfaceKind` of every group, one of the five analytic kinds, shape (G,).
+        parameters: As in `Segmentation.parameters`, shape (G, 8).
+        centre: Centre of every group [mm], shape (G, 3).
+        extent: Extent of every group [mm], shape (G,).
+
+    Returns:
+        As of `iterate`, shape (G, KINDS, STATE); NaN for the other kinds.
+    """
+    rows, e = np.arange(len(kind)), extent[:, None]
+    point, axis = (parameters[:, :3] - centre) / e, parameters[:, 3:6]
+    height = np.einsum("gi,gi->g", point, axis)
+    # What moves on along the axis is beside the centre, the point of a plane nearest to it.
+    flat, free = kind == PLANE, (kind == CYLINDER) | (kind == CONE)
+    point = np.where(flat[:, None], height[:, None] * axis, point)
+    point = np.where(free[:, None], point - height[:, None] * axis, point)
+    own = np.zeros((len(kind), STATE))
+    own[:, :3], own[:, 3:6] = point, axis
+    own[:, 9] = np.where(flat, 0.0, parameters[:, 6] / extent)
+    own[:, 10] = np.where(kind == TORUS, parameters[:, 7] / extent, 0.0)
+    cone = kind == CONE
+    own[cone, 9] = parameters[cone, 6]
+    own[cone, 10] = -height[cone] * np.sin(parameters[cone, 6])
+    state = np.full((len(kind), KINDS, STATE), np.nan)
+    state[rows, kind] = own
+    return with_directions(state)
 
 
 class _Samples:

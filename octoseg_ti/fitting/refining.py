@@ -2,12 +2,9 @@
 
 import numpy as np
 
-from octoseg_ti.device.surfaces import KINDS, evaluate_surfaces
-from octoseg_ti.fitting.covariance import WAYS, distance_gradient, padded, ways_of
-from octoseg_ti.fitting.primitives import TUKEY
-
-_DAMPING = 1e-9  # of the squares of the columns: what no point holds stays where it is
-_LEAST = 1e-12
+from octoseg_ti.device.surfaces import KINDS, SPHERE
+from octoseg_ti.fitting.descent import iterate
+from octoseg_ti.fitting.primitives import FREEDOM, TUKEY, to_parameters, to_states
 
 
 def refine(
@@ -17,12 +14,12 @@ def refine(
     parameters: np.ndarray,
     *,
     noise: float,
-    rounds: int = 4,
+    rounds: int = 5,
 ) -> np.ndarray:
-    """Return the parameters of surfaces after some steps of Gauss and Newton.
+    """Return the parameters of surfaces after some steps of Levenberg and Marquardt.
 
     The sum of Tukey's loss of the orthogonal distances falls with every step that is taken; a
-    surface whose next step does not lower it stays.
+    surface whose steps do not lower it stays, and so does one of fewer points than unknowns.
 
     Args:
         points: The points of every surface, one group after the other [mm], shape (S, 3), f64.
@@ -35,45 +32,29 @@ def refine(
     Returns:
         Shape (M, 8).
     """
-    kind, start = np.asarray(kind, np.int32), np.asarray(start, np.int64)
+    kind, start = np.asarray(kind, np.int32), np.asarray(start, np.int32)
     count = np.diff(start)
-    owner = np.repeat(np.arange(len(kind), dtype=np.int32), count)
-    reach = TUKEY * noise
-    best, tried = parameters.copy(), parameters.copy()
-    least = np.full(len(kind), np.inf)
-    for turn in range(rounds + 1):
-        far, normal = evaluate_surfaces(points, owner, kind, tried)
-        share = np.minimum((far / reach) ** 2, 1.0)
-        loss = np.bincount(owner, 1.0 - (1.0 - share) ** 3, len(kind))
-        better = loss < least
-        best[better], least[better] = tried[better], loss[better]
-        if turn == rounds or not better.any():
-            break
-        weight = (1.0 - share) * better[owner]
-        change = distance_gradient(points, normal, kind[owner], best[owner])
-        tried = _stepped(start, kind, best, change * weight[:, None], far * weight)
-    return best
-
-
-def _stepped(
-    start: np.ndarray, kind: np.ndarray, parameters: np.ndarray, change: np.ndarray, far: np.ndarray
-) -> np.ndarray:
-    """Return the parameters after a step that takes weighted distances away, (M, 8)."""
-    stepped, count = parameters.copy(), np.diff(start)
-    for code in range(KINDS):
-        which = np.flatnonzero((kind == code) & (count > len(WAYS[code])))
-        if len(which) == 0:
-            continue
-        place, there = padded(start, which)
-        ways = ways_of(parameters[which, 3:6])[:, :, WAYS[code]]
-        columns = np.einsum("mni,mik->kmn", change[place], ways) * there
-        # No product of matrices: its sums may depend on the threads.
-        square = np.einsum("kmn,lmn->mkl", columns, columns)
-        side = np.einsum("kmn,mn->mk", columns, far[place] * there)
-        diagonal = np.einsum("mkk->mk", square)
-        diagonal += _DAMPING * diagonal + _LEAST
-        step = -np.einsum("mik,mk->mi", ways, np.linalg.solve(square, side[..., None])[..., 0])
-        stepped[which] += np.where(np.isfinite(parameters[which]), step, 0.0)
-    axis = stepped[:, 3:6]
-    stepped[:, 3:6] = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), _LEAST)
-    return stepped
+    which = np.flatnonzero(count > FREEDOM[kind])
+    if len(which) == 0:
+        return parameters.copy()
+    owner = np.repeat(np.arange(len(kind)), count)
+    total = np.maximum(count, 1)
+    centre = np.column_stack([np.bincount(owner, x, len(kind)) for x in points.T]) / total[:, None]
+    square = np.einsum("si,si->s", points - centre[owner], points - centre[owner])
+    extent = np.sqrt(np.bincount(owner, square, len(kind)) / total)
+    extent[extent == 0.0] = 1.0
+    state = to_states(kind, parameters, centre, extent)
+    state[count <= FREEDOM[kind]] = np.nan
+    reach = np.repeat(TUKEY * noise / extent[:, None], KINDS, axis=1)
+    frame = np.column_stack([centre, 1.0 / extent])
+    state = iterate(
+        points, np.ones(len(points)), start, frame, reach, state[None],
+        rounds=rounds, thin=False, leave=False,
+    )  # fmt: skip
+    found = to_parameters(state, centre, extent)[which, kind[which]]
+    if np.any(kind == SPHERE):
+        ball = kind[which] == SPHERE
+        found[ball, 3:6] = parameters[which[ball], 3:6]  # its axis means nothing
+    refined = parameters.copy()
+    refined[which] = found
+    return refined

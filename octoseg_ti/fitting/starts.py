@@ -415,10 +415,18 @@ def starts(
     place(TORUS, square, height, np.maximum(ring, _LEAST), tube)
     state[0, :, SPHERE, :3], state[0, :, SPHERE, 9] = _spheres(m)
     state[0, :, PLANE, 3:6] = np.linalg.eigh(np.nan_to_num(m.qq))[1][:, :, 0]
-    # Towards the points, which are about the origin.
-    toward = -state[..., :3]
-    state[0, :, SPHERE, 3:6] = _toward(toward[0, :, SPHERE], across(toward[0, :, SPHERE]))
-    axis = state[..., 3:6]
+    return with_directions(state)
+
+
+def with_directions(state: np.ndarray) -> np.ndarray:
+    """Return states with u, and the axis of spheres, towards the origin, which the points surround.
+
+    Args:
+        state: Points, axes and shapes, shape (..., KINDS, STATE).
+    """
+    state = state.copy()
+    state[..., SPHERE, 3:6] = _toward(-state[..., SPHERE, :3], across(-state[..., SPHERE, :3]))
+    axis, toward = state[..., 3:6], -state[..., :3]
     toward = toward - np.sum(toward * axis, axis=-1, keepdims=True) * axis
     state[..., 6:9] = _toward(toward, across(axis))
     return state
