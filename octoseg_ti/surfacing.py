@@ -12,7 +12,7 @@ from octoseg_ti.params import Params
 from octoseg_ti.patches import Regions, relabelled
 from octoseg_ti.stages.extraction import Tolerance
 from octoseg_ti.stages.grid import Grid
-from octoseg_ti.stages.labelling import Labelling, Rule, label_lists, surface_table
+from octoseg_ti.stages.labelling import Labelling, Rule, common_label, label_lists, surface_table
 from octoseg_ti.stages.leaves import Leaves, leaf_graph, without_gaps
 from octoseg_ti.stages.merging import mean_squares, pieces
 from octoseg_ti.stages.settling import settle
@@ -52,7 +52,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         Tolerance(noise, turn, fewest, exact), rule, narrow=exact,
     )  # fmt: skip
     gap = params.normals.gap
-    near = graph if gap is None else without_gaps(grid, graph, PIECE_GAPS * gap)
+    near = graph if gap is None else without_gaps(graph, PIECE_GAPS * gap)
     label, surface = number_pieces(near, surfaced, least, fewest)
     label, surface, free = _with_free_forms(label, surface, found, least)
     if len(surface):
@@ -151,18 +151,20 @@ def number_pieces(
         Patch of every sorted point, -1 = none, shape (n,), i32; and the surface of every patch.
     """
     piece = pieces(leaves, found.own, len(found.surfaces))
-    leaf = np.repeat(np.arange(len(leaves)), leaves.count)
-    there = found.label >= 0
-    cell, name = leaf[there], found.label[there]
-    mine = piece[cell, 0]
-    others = np.flatnonzero(found.own[cell, 0] != name)
-    rank = (found.own[cell[others]] == name[others, None]).argmax(axis=1)
-    mine[others] = piece[cell[others], rank]
+    mine = np.repeat(piece[:, 0], leaves.count)
+    # Where a leaf holds nothing but its first surface, all of its points are of that piece.
+    mixed = (found.own[:, 1] >= 0) | (common_label(leaves, found.label) < 0)
+    (others,) = np.nonzero(np.repeat(mixed, leaves.count))
+    cell = np.repeat(np.flatnonzero(mixed), leaves.count[mixed])
+    rank = (found.own[cell] == found.label[others, None]).argmax(axis=1)
+    mine[others] = np.where(found.label[others] < 0, NONE, piece[cell, rank])
+    there = mine >= 0
+    mine = mine[there]
     size = np.bincount(mine)
+    surface = found.own[found.own >= 0][: len(size)]  # pieces are named by an entry of the lists
     most = np.zeros(len(found.surfaces), np.int64)
-    np.maximum.at(most, name, size[mine])
-    main = np.zeros(len(size), bool)
-    main[mine] = size[mine] == most[name]
+    np.maximum.at(most, surface, size)
+    main = (size > 0) & (size == most[surface])
     # Where surfaces touch smoothly one goes on within the other, and gets some of its points.
     (square,) = mean_squares(mine, found.off[there], (_CAP,), size, np.zeros_like(size))
     within = square <= EXPLAINED
@@ -173,4 +175,4 @@ def number_pieces(
     number[names] = np.arange(len(names), dtype=np.int32)
     label = np.full(len(found.label), NONE, np.int32)
     label[there] = number[mine]
-    return label, found.own[found.own >= 0][names]  # pieces are named by an entry of the lists
+    return label, surface[names]

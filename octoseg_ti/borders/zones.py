@@ -14,7 +14,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.stages.extraction import Surfaces
 from octoseg_ti.stages.labelling import label_lists, near_lists
-from octoseg_ti.stages.leaves import Leaves, leaf_boxes, members_of
+from octoseg_ti.stages.leaves import Leaves, members_of
 from octoseg_ti.stages.profiles import BALL, NOWHERE, Places, place, sums
 from octoseg_ti.stages.sets import spread
 from octoseg_ti.types import NONE, SurfaceKind
@@ -116,7 +116,7 @@ class Search:
         self.own = label_lists(leaves, label)
         self.near = near_lists(leaves, self.own)
         self.claim = np.full(len(label), NONE, np.int32)
-        self.box = leaf_boxes(self.points, leaves)
+        self.box = leaves.box
 
     def leaf_of(self, point: np.ndarray) -> np.ndarray:
         """Return the leaves that hold some points, shape (E,)."""

@@ -6,7 +6,7 @@ The points of a leaf are picked by a hash of their coordinates: which ones does 
 order in which they were scanned.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -33,6 +33,8 @@ class Leaves:
     """Points of every leaf, shape (C,), i32."""
     size: np.ndarray
     """Edge length of every leaf [mm], shape (C,), f64."""
+    box: np.ndarray
+    """Lower and upper corner of the points of every leaf, as these are [mm], shape (C, 6), f64."""
     a: np.ndarray
     """One leaf of every pair that touches, shape (E,), i32."""
     b: np.ndarray
@@ -135,67 +137,61 @@ def leaf_graph(grid: Grid, node: np.ndarray, touching: Adjacency) -> Leaves:
     held = np.arange(neighbor.shape[1], dtype=np.int32) < count[:, None]
     a = place[np.repeat(np.arange(grid.count), count)]
     b = place[neighbor[held]]
-    return _linked(node, grid.first[node], grid.holds[node], grid.edge_length[node], a, b)
-
-
-def _linked(
-    node: np.ndarray,
-    first: np.ndarray,
-    count: np.ndarray,
-    size: np.ndarray,
-    a: np.ndarray,
-    b: np.ndarray,
-) -> Leaves:
-    """Return leaves with the pairs ``a`` and ``b`` of them that touch."""
-    one, other = np.concatenate([a, b]), np.concatenate([b, a])
-    order = np.argsort(one.astype(np.int64) * len(node) + other, kind="stable")
-    ends = np.cumsum(np.bincount(one, minlength=len(node)))
+    start, neighbor = _linked(len(node), a, b)
     return Leaves(
         node=node,
-        first=first,
-        count=count,
-        size=size,
+        first=grid.first[node],
+        count=grid.holds[node],
+        size=grid.edge_length[node],
+        box=leaf_boxes(runtime.download(grid.point), grid.first[node]),
         a=a,
         b=b,
-        start=np.concatenate([[0], ends]).astype(np.int32),
-        neighbor=other[order],
+        start=start,
+        neighbor=neighbor,
     )
 
 
-def leaf_boxes(points: np.ndarray, leaves: Leaves) -> np.ndarray:
+def _linked(count: int, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return what pairs say of each of so many leaves, as `Leaves.start` and its ``neighbor``."""
+    one, other = np.concatenate([a, b]), np.concatenate([b, a])
+    # All keys differ: to sort them is faster than to sort places by them.
+    key = np.sort(one.astype(np.int64) * max(count, 1) + other)
+    start = np.searchsorted(key, np.arange(count + 1, dtype=np.int64) * count)
+    return start.astype(np.int32), (key % max(count, 1)).astype(np.int32)
+
+
+def leaf_boxes(points: np.ndarray, first: np.ndarray) -> np.ndarray:
     """Return the lower and upper corner of the points of every leaf [mm], shape (C, 6).
 
     Args:
         points: Sorted positions [mm], shape (n, 3), f64.
-        leaves: The leaves.
+        first: First point of every leaf, ascending, shape (C,).
     """
-    low = np.minimum.reduceat(points, leaves.first, axis=0)
-    high = np.maximum.reduceat(points, leaves.first, axis=0)
+    low = np.minimum.reduceat(points, first, axis=0)
+    high = np.maximum.reduceat(points, first, axis=0)
     return np.concatenate([low, high], axis=1)
 
 
-def without_gaps(grid: Grid, leaves: Leaves, gap: float) -> Leaves:
+def without_gaps(leaves: Leaves, gap: float) -> Leaves:
     """Return the leaves without the pairs whose points are far apart, though the boxes touch.
 
     Args:
-        grid: The sparse grid.
-        leaves: Its leaves.
+        leaves: The leaves.
         gap: Largest distance of the boxes around the points of two leaves [mm].
     """
     wide = np.flatnonzero(leaves.size[leaves.a] + leaves.size[leaves.b] > gap)
     if len(wide) == 0:
         return leaves
-    box = leaf_boxes(runtime.download(grid.point), leaves)
-    low, high = box[:, :3], box[:, 3:]
+    low, high = leaves.box[:, :3], leaves.box[:, 3:]
     a, b = leaves.a[wide], leaves.b[wide]
     apart = np.maximum(np.maximum(low[a] - high[b], low[b] - high[a]), 0.0)
     kept = np.ones(len(leaves.a), bool)
     kept[wide] = np.einsum("ij,ij->i", apart, apart) <= gap**2
     if kept.all():
         return leaves
-    return _linked(
-        leaves.node, leaves.first, leaves.count, leaves.size, leaves.a[kept], leaves.b[kept]
-    )
+    a, b = leaves.a[kept], leaves.b[kept]
+    start, neighbor = _linked(len(leaves), a, b)
+    return replace(leaves, a=a, b=b, start=start, neighbor=neighbor)
 
 
 def sample_leaves(
@@ -258,6 +254,9 @@ def distinct(key: np.ndarray) -> np.ndarray:
 
 def members_of(label: np.ndarray, count: int) -> list[np.ndarray]:
     """Return the members of every label 0..count-1, ascending, an array of indices for each."""
-    order = np.argsort(label, kind="stable")
-    ends = np.searchsorted(label[order], np.arange(count + 1))
+    n = max(len(label), 1)
+    # All keys differ: to sort them is faster than to sort places by them.
+    key = np.sort(label.astype(np.int64) * n + np.arange(len(label)))
+    ends = np.searchsorted(key, np.arange(count + 1) * n)
+    order = key % n
     return [order[lo:hi] for lo, hi in pairwise(ends)]

@@ -19,7 +19,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import box_gap, row, vec3
 from octoseg_ti.device.runtime import F32Rows, F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.surfaces import surface_in_row
-from octoseg_ti.stages.leaves import Leaves, leaf_boxes
+from octoseg_ti.stages.leaves import Leaves
 from octoseg_ti.types import SurfaceKind
 
 DOUBT = 9.0
@@ -146,13 +146,12 @@ def settle(
     if len(surfaces) == 0:
         return runtime.download(label)
     settled = runtime.empty(label.shape[0], np.int32)
-    box = leaf_boxes(runtime.download(points), leaves)
     link = np.stack(
         [leaves.first, leaves.first + leaves.count, leaves.start[:-1], leaves.start[1:]], axis=1
     )
     _settle(
         reach, farthest, doubt, points, runtime.upload(surfaces),
         label, second, off,
-        runtime.upload(box), runtime.upload(link), runtime.upload(leaves.neighbor), settled,
+        runtime.upload(leaves.box), runtime.upload(link), runtime.upload(leaves.neighbor), settled,
     )  # fmt: skip
     return runtime.download(settled)

@@ -45,7 +45,7 @@ def test_pairs_over_a_gap_are_left_out(seed: int, gap: float) -> None:
         return float(np.linalg.norm(np.maximum(apart, 0.0))) <= gap
 
     expected = [(int(a), int(b)) for a, b in zip(leaves.a, leaves.b, strict=True) if near(a, b)]
-    linked = without_gaps(grid, leaves, gap)
+    linked = without_gaps(leaves, gap)
     assert list(zip(linked.a.tolist(), linked.b.tolist(), strict=True)) == expected
     assert (len(expected) == len(leaves.a)) == (linked is leaves)
     degree = np.diff(linked.start)

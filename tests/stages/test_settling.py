@@ -63,7 +63,7 @@ def two_surfaces(
     point: np.ndarray, kind: np.ndarray, parameters: np.ndarray, cell: float
 ) -> tuple[Scene, np.ndarray]:
     """Return points that took the nearer one of two surfaces, and where these rows came from."""
-    leaves, order, _ = leaves_of(point - point.min(axis=0), cell)
+    leaves, order, _ = leaves_of(point, cell)
     point = point[order]
     far = [np.abs(distance_of(point, kind[s], parameters[s])) / NOISE for s in range(2)]
     label = (far[1] < far[0]).astype(np.int32)
