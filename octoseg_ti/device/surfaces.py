@@ -74,19 +74,22 @@ def surface_at(kind: ti.i32, point: vec3, origin: vec3, axis: vec3, a: ti.f64, b
     """
     q = point - origin
     z = axis.dot(q)
-    away = q - z * axis
-    rho = away.norm()
-    shape = vec4(a, b, 0.0, 0.0)
-    if kind == CONE:
-        shape = cone_shape(a, 0.0)
-    f = profile(kind, rho, z, shape)
-    d = f[0]
-    n = f[2] * axis
-    if rho > 0.0:
-        n += (f[1] / rho) * away
-    if kind == CONE and z * shape[2] + rho * shape[3] < 0.0:
-        d = q.norm()
-        n = q / d
+    d = z
+    n = axis
+    if kind != PLANE:
+        away = q - z * axis
+        rho = away.norm()
+        shape = vec4(a, b, 0.0, 0.0)
+        if kind == CONE:
+            shape = cone_shape(a, 0.0)
+        f = profile(kind, rho, z, shape)
+        d = f[0]
+        n = f[2] * axis
+        if rho > 0.0:
+            n += (f[1] / rho) * away
+        if kind == CONE and z * shape[2] + rho * shape[3] < 0.0:
+            d = q.norm()
+            n = q / d
     return d, n
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from octoseg_ti.device import runtime
-from octoseg_ti.device.linalg import row, vec3
+from octoseg_ti.device.linalg import angle_of, row, vec3
 from octoseg_ti.device.runtime import F32Rows, F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.surfaces import surface_in_row
 from octoseg_ti.stages.grid import Grid
@@ -123,7 +123,7 @@ def _choose(
                 least = off * off + surface_in[s, 9]
                 if least < after[0] or (off <= rule[2] and least < best[0]):
                     facing = ti.select(m.norm_sqr() > 0.0, ti.abs(n.dot(m)), 1.0)
-                    angle = ti.acos(ti.min(1.0, facing))
+                    angle = angle_of(ti.min(1.0, facing))
                     turn = angle / rule[1]
                     # Beyond six deviations hardly more: of two surfaces through a point of an edge
                     # the one that it faces a little.

@@ -5,8 +5,8 @@ import pytest
 from reference.clouds import rotation
 
 from octoseg_ti.device import runtime
-from octoseg_ti.device.linalg import row, symmetric_eigen
-from octoseg_ti.device.runtime import F64Rows, ti
+from octoseg_ti.device.linalg import angle_of, row, symmetric_eigen
+from octoseg_ti.device.runtime import F64Array, F64Rows, ti
 
 
 @ti.kernel
@@ -46,6 +46,18 @@ def _copy_rows(
         twice = 2.0 * row(row_in, i)
         for k in ti.static(range(3)):
             row_out[i, k] = twice[k]
+
+
+@ti.kernel
+def _angles(
+    # In:
+    cosine_in: F64Array,
+    # Out:
+    angle_out: F64Array,
+):
+    """Write the angle of every cosine."""
+    for i in cosine_in:
+        angle_out[i] = angle_of(cosine_in[i])
 
 
 def solve(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -121,3 +133,14 @@ def test_row() -> None:
     out = runtime.empty((7, 3), np.float64)
     _copy_rows(runtime.upload(rows), out)
     np.testing.assert_array_equal(runtime.download(out), 2.0 * rows)
+
+
+def test_angles_of_cosines() -> None:
+    runtime.ensure_started()
+    true = np.concatenate([[0.0], np.geomspace(1e-7, 0.5 * np.pi, 999), [0.5 * np.pi]])
+    cosine = np.clip(np.cos(true), 0.0, 1.0)
+    out = runtime.empty(len(true), np.float64)
+    _angles(runtime.upload(cosine), out)
+    angle = runtime.download(out)
+    assert angle[0] == 0.0
+    np.testing.assert_allclose(angle, np.arccos(cosine), rtol=3e-8, atol=2.1e-8)
