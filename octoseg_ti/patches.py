@@ -11,7 +11,7 @@ from octoseg_ti.arrange import Arranged
 from octoseg_ti.borders.tracing import Borders
 from octoseg_ti.defaults import PIECE_GAPS, spacing_of
 from octoseg_ti.device import runtime
-from octoseg_ti.device.surfaces import evaluate_surfaces
+from octoseg_ti.device.surfaces import distances_to_surfaces
 from octoseg_ti.params import Params
 from octoseg_ti.readmission import readmit
 from octoseg_ti.stages.adjacency import Adjacency, find_touching
@@ -200,7 +200,7 @@ def assemble(
     left_out = np.flatnonzero(outlier)
     outside = scans_in_world(scans, left_out)
     back = _come_back(outside, grid, found, params)
-    size = np.bincount(found.label[found.label >= 0], minlength=patches)
+    size = np.bincount(found.label + 1, minlength=patches + 1)[1:]
     size += np.bincount(back[back >= 0], minlength=patches)
     rank = np.argsort(-size, kind="stable")
     name = np.full(patches + 1, NONE, np.int32)
@@ -321,14 +321,13 @@ def _describe(
     covariance[on] = found.covariance[which]
     surface[on] = which
     surface[found.surface < 0] = len(found.kind) + np.arange(patches - len(on))
-    lying = found.label >= 0
-    lying[lying] = found.surface[found.label[lying]] >= 0
-    region = found.label[lying]
-    far, _ = evaluate_surfaces(
-        runtime.download(grid.point)[lying], found.surface[region], found.kind, found.parameters
+    far = distances_to_surfaces(
+        grid.point, np.append(found.surface, NONE)[found.label], found.kind, found.parameters
     )
-    count = np.maximum(np.bincount(region, minlength=patches), 1)
-    residual[on] = np.sqrt(np.bincount(region, far**2, patches) / count)[on]
+    # What has no patch comes first.
+    count = np.maximum(np.bincount(found.label + 1, minlength=patches + 1)[1:], 1)
+    square = np.bincount(found.label + 1, far**2, patches + 1)[1:]
+    residual[on] = np.sqrt(square / count)[on]
     return kind, parameters, covariance, residual, surface
 
 

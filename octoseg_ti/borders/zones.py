@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from octoseg_ti.device import runtime
-from octoseg_ti.device.surfaces import evaluate_surfaces
+from octoseg_ti.device.surfaces import distances_to_surfaces, evaluate_surfaces
 from octoseg_ti.stages.extraction import Surfaces
 from octoseg_ti.stages.labelling import label_lists, near_lists
 from octoseg_ti.stages.leaves import Leaves, members_of
@@ -107,12 +107,11 @@ class Search:
         self.given = self.table.copy()
         self.set_sides()
         # Distance of every point from the surface of its patch [mm], capped.
-        self.off = np.full(len(label), CAP * noise)
-        there = np.flatnonzero((label >= 0) & self.analytic[np.maximum(label, 0)])
-        far, _ = evaluate_surfaces(
-            self.points[there], label[there], self.table[:, 8].astype(np.int32), self.table[:, :8]
+        own = np.append(np.where(self.analytic, np.arange(self.count), NONE), NONE)[label]
+        far = distances_to_surfaces(
+            points, own, self.table[:, 8].astype(np.int32), self.table[:, :8]
         )
-        self.off[there] = np.minimum(np.abs(far), CAP * noise)
+        self.off = np.minimum(np.abs(far), CAP * noise)
         self.own = label_lists(leaves, label)
         self.near = near_lists(leaves, self.own)
         self.claim = np.full(len(label), NONE, np.int32)

@@ -148,3 +148,49 @@ def evaluate_surfaces(
             normal,
         )
     return runtime.download(distance)[:n], runtime.download(normal)[:n]
+
+
+@ti.kernel
+def _measure_distances(
+    # In:
+    point_in: F64Rows,
+    which_in: I32Array,
+    kind_in: I32Array,
+    parameters_in: F64Rows,
+    # Out:
+    distance_out: F64Array,
+):
+    """Write the distance of every point to the surface that it names, infinite where it is -1."""
+    for i in which_in:
+        m = which_in[i]
+        d = ti.math.inf
+        if m >= 0:
+            d, _ = surface_in_row(parameters_in, m, kind_in[m], row(point_in, i))
+        distance_out[i] = d
+
+
+def distances_to_surfaces(
+    points: Any, which: np.ndarray, kind: np.ndarray, parameters: np.ndarray
+) -> np.ndarray:
+    """Return how far every point is from the surface that it names, if it names any.
+
+    Args:
+        points: Positions [mm], shape (N, 3), f64 (kernel array).
+        which: Surface of every point, -1 = none, shape (N,), i32.
+        kind: `SurfaceKind` of every surface, shape (M,), one of the five analytic kinds.
+        parameters: As in `Segmentation.parameters`, shape (M, 8), f64.
+
+    Returns:
+        Signed distance [mm], shape (N,), positive outside; infinite where there is no surface.
+    """
+    runtime.ensure_started()
+    distance = runtime.empty(len(which), np.float64)
+    if len(which):
+        _measure_distances(
+            points,
+            runtime.upload(np.asarray(which, np.int32)),
+            runtime.upload(np.asarray(kind, np.int32)),
+            runtime.upload(np.asarray(parameters, np.float64)),
+            distance,
+        )
+    return runtime.download(distance)[: len(which)]

@@ -5,7 +5,8 @@ import pytest
 from reference.clouds import rotation
 from reference.surfaces import CONE, TORUS, distance_of, patch_of, placed
 
-from octoseg_ti.device.surfaces import KINDS, evaluate_surfaces
+from octoseg_ti.device import runtime
+from octoseg_ti.device.surfaces import KINDS, distances_to_surfaces, evaluate_surfaces
 from octoseg_ti.types import SurfaceKind
 
 
@@ -77,3 +78,17 @@ def test_no_parameters_no_distance_and_no_points() -> None:
     assert np.isnan(distance).all()
     distance, normal = evaluate_surfaces(np.zeros((0, 3)), np.zeros(0), np.array([1]), unknown)
     assert (distance.shape, normal.shape) == ((0,), (0, 3))
+
+
+def test_distances_alone_are_the_same_and_infinite_without_a_surface() -> None:
+    models = np.stack([surface(k, 7 + k) for k in range(KINDS)])
+    rng = np.random.default_rng(1)
+    which = rng.integers(-1, KINDS, 300).astype(np.int32)
+    points = rng.uniform(-60, 60, (300, 3))
+    alone = distances_to_surfaces(runtime.upload(points), which, np.arange(KINDS), models)
+    there = which >= 0
+    distance, _ = evaluate_surfaces(points[there], which[there], np.arange(KINDS), models)
+    np.testing.assert_array_equal(alone[there], distance)
+    assert np.isinf(alone[~there]).all()
+    none = np.zeros((0, 3))
+    assert len(distances_to_surfaces(none, np.zeros(0, np.int32), np.arange(KINDS), models)) == 0
