@@ -323,7 +323,7 @@ class _Search:
     def give_up_slivers(self) -> None:
         """Give up small surfaces that were cut out of the ragged rim of something else."""
         label = self.label
-        size = np.bincount(label[label >= 0], minlength=len(self.surfaces))
+        size = np.bincount(label + 1, minlength=len(self.surfaces) + 1)[1:]
         small = size < FREE * self.tolerance.points
         here = np.flatnonzero(np.append(small, False)[label])
         if len(here) == 0:

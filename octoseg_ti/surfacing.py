@@ -120,13 +120,16 @@ def _with_free_forms(
         Patch of every point, the free forms last; surface of every other patch; and how many free
         forms there are.
     """
-    rest = (label < 0) & (found.label >= 0)
-    size = np.bincount(found.label[found.label >= 0], minlength=found.count)
-    left = np.bincount(found.label[rest], minlength=found.count)
-    stay = np.flatnonzero((2 * left >= size) & (left >= least))
+    size = np.bincount(found.label + 1, minlength=found.count + 1)[1:]
+    left = np.bincount(found.label[label < 0] + 1, minlength=found.count + 1)[1:]
+    stays = (2 * left >= size) & (left >= least)
+    stay = np.flatnonzero(stays)
+    if len(stay) == 0:
+        return label, surface, 0
     # Nothing tells a small surface within a free form from a part of it.
-    size = np.bincount(label[label >= 0], minlength=len(surface))
-    within = np.bincount(label[(label >= 0) & np.isin(found.label, stay)], minlength=len(surface))
+    size = np.bincount(label + 1, minlength=len(surface) + 1)[1:]
+    inside = np.append(stays, False)[found.label]
+    within = np.bincount(label[inside] + 1, minlength=len(surface) + 1)[1:]
     kept = (size >= FREE * least) | (2 * within < size)
     number = np.full(len(surface) + 1, NONE, np.int32)
     number[:-1][kept] = np.arange(np.count_nonzero(kept), dtype=np.int32)

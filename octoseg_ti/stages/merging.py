@@ -183,7 +183,7 @@ def explained_by_others(
     """
     here = np.flatnonzero((label >= 0) & (second >= 0))
     mine, other, near = label[here], second[here], off[here]
-    size = np.bincount(label[label >= 0], minlength=count)
+    size = np.bincount(label + 1, minlength=count + 1)[1:]
     alone = size - np.bincount(mine, minlength=count)
     far, deviation = mean_squares(mine, near[:, 0], (_CAP, 2.0 * _FORM), size, alone)
     (turn,) = mean_squares(mine, near[:, 1], (2.0 * _SMOOTH,), size, alone)
