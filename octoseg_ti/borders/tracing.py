@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from octoseg_ti.borders.blends import find_blends, mark_blends
+from octoseg_ti.borders.corners import find_corners, mark_corners, parts_of
 from octoseg_ti.borders.fillets import (
     ON,
     WEAK,
@@ -28,6 +29,7 @@ from octoseg_ti.borders.fillets import (
     look_around,
     refit_sides,
     smooth_pairs,
+    strip_pairs,
     strips_of,
 )
 from octoseg_ti.borders.rims import mark_rims
@@ -75,16 +77,29 @@ def find_borders(search: Search, lines: Lines | None = None) -> Borders:
     zones = find_zones(search)
     around = look_around(search, zones)
     guess = guess_radii(search, zones, around)
+    chosen = np.zeros(0, bool)
     for turn in range(_ROUNDS):
         if turn:
+            corners = find_corners(search, zones, fit, chosen)
+            parts = parts_of(search, zones, corners, strip_pairs(search, zones, chosen))
             refit_sides(search)
+            if parts.patch.any():
+                # They are no sides of fillets, but the tubes go on over them.
+                search.held[corners.point] = True
+                zones = find_zones(search, parts.strip)
+                around = look_around(search, zones)
+                radius, hope = guess_radii(search, zones, around)
+                guess = radius, hope & ~parts.patch[zones.pairs].any(axis=1)
         fit = fit_balls(search, zones, around, guess, last=turn == _ROUNDS - 1)
         chosen = claim_points(search, zones, fit)
     fillets = np.flatnonzero(chosen)
     number = np.full(len(zones.pairs) + 1, NONE, np.int32)
     number[fillets] = np.arange(len(fillets), dtype=np.int32)
     strip = strips_of(search, number)
-    edge = mark_points(search, zones, fit, chosen, strip)
+    corners = find_corners(search, zones, fit, chosen)
+    parts = parts_of(search, zones, corners, strip_pairs(search, zones, chosen))
+    edge = mark_points(search, zones, fit, chosen, strip, parts.smooth)
+    mark_corners(search, corners, edge)
     if lines is not None:
         mark_rims(search, lines, edge)
     sides = zones.pairs[fillets].astype(np.int32)
@@ -143,12 +158,26 @@ def give_back(
 
 
 def mark_points(
-    search: Search, zones: Zones, fit: Fit, chosen: np.ndarray, strip: np.ndarray
+    search: Search,
+    zones: Zones,
+    fit: Fit,
+    chosen: np.ndarray,
+    strip: np.ndarray,
+    joined: np.ndarray,
 ) -> np.ndarray:
-    """Return the `EdgeClass` of every point: that of the nearest edge within two spacings."""
+    """Return the `EdgeClass` of every point: that of the nearest edge within two spacings.
+
+    Args:
+        search: What is known.
+        zones: The pairs of patches.
+        fit: The balls of all pairs.
+        chosen: Which pairs are fillets, shape (P,), bool.
+        strip: Fillet that every patch is a strip of, -1 = none, shape (K,).
+        joined: Which pairs are known to join smoothly, shape (P,), bool.
+    """
     leaves, reach = search.leaves, EDGE * search.spacing
     radius = np.where(chosen, fit.radius, 1e-12 * fit.hollow)
-    smooth = smooth_pairs(search, zones.pairs, fit.turn) | fit.large | (fit.points < 5)
+    smooth = smooth_pairs(search, zones.pairs, fit.turn) | fit.large | (fit.points < 5) | joined
     smooth &= ~chosen
     idle = ~chosen & (strip[zones.pairs] >= 0).any(axis=1) & smooth
     # The leaves of the zones, and those that touch them.
