@@ -90,6 +90,8 @@ def find_base(
     walls = count >= _FEWEST
     near = walls & (outer >= outer[walls].max() - _STEP * spacing)
     even = near & (outer - low < _EVEN * spacing)
+    # Where points end at any distance up to a spacing, that share of them is beyond the quantile.
+    outer = outer + np.where(even, 0.0, (1.0 - _OUTER) * spacing)
     base = outer[near].max()
     if not (near & ~even).any():
         # No wall shows the plane itself; it is above the next stripe of each.

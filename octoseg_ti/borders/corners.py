@@ -69,9 +69,14 @@ def find_corners(search: Search, zones: Zones, fit: Fit, chosen: np.ndarray) -> 
         chosen: Which pairs are fillets, shape (P,), bool.
     """
     meeting = fillets_that_meet(zones.pairs, fit, chosen)
+    none = np.zeros(0, np.int64)
+    if len(meeting) == 0:
+        return Corners(
+            np.zeros((0, 3), np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3, 3)), none, none
+        )
     sides = np.sort(zones.pairs[meeting].reshape(-1, 4), axis=1)
     # Of four names one is there twice.
-    twice = np.argmax(sides[:, 1:] == sides[:, :-1], axis=1)[:, None] if len(sides) else 0
+    twice = np.argmax(sides[:, 1:] == sides[:, :-1], axis=1)[:, None]
     sides = sides[np.arange(4) != twice].reshape(-1, 3)
     weight = 1.0 / np.maximum(fit.deviation[meeting], 1e-9) ** 2
     radius = (weight * fit.radius[meeting]).sum(axis=1) / weight.sum(axis=1)

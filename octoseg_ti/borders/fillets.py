@@ -34,10 +34,11 @@ _RATIO = 1.15
 _SKIP, _SURE = 4, 4.0
 _HOPE = 0.03  # share of the points that a radius has to explain beyond a sharp edge, to go on
 _NEWTON = 6
-# A fillet gains at least this much over a sharp edge, in squares of the noise: in all, and for each
-# point on it: more than errors of the sides do, but no more than this share of what a ball of its
-# radius gains where the edge is shallow.
-_GAIN, _EACH, _EXPECTED = 40.0, (0.1, 0.25), 0.5
+# A fillet gains at least this much over a sharp edge: in all, in squares of the noise; and for each
+# point on it, in squares of how far points are from their surfaces, if this share of the noise and
+# more: more than errors of the sides do, but no more than this share of what a ball of its radius
+# gains where the edge is shallow.
+_GAIN, _EACH, _SCATTER, _EXPECTED = 40.0, (0.1, 0.25), 0.5, 0.5
 _STEEP = 2.5  # turns beyond this [rad] count as this one
 _ARC = 1.5  # a fillet is at least this wide [spacings]
 FEWEST = 8
@@ -175,11 +176,12 @@ def fit_balls(
     gain = (none[:, 0] - now[:, 0]) / noise**2
     # The mean square of the distances from a ball to the sharp edge within it.
     wide = radius * (1.0 / np.cos(np.minimum(around.turn, _STEEP) / 2.0) - 1.0)
-    each = np.clip(_EXPECTED * wide**2 / (5.0 * noise**2), *_EACH)
+    scatter = float(np.clip(search.usual(), _SCATTER * noise, noise))
+    each = np.clip(_EXPECTED * wide**2 / (5.0 * scatter**2), *_EACH)
     rms = np.sqrt(now[:, 0] / total)
     rounded = hope & (
         (gain * around.every >= _GAIN * total)
-        & (gain >= each * now[:, 3])
+        & (gain * noise**2 >= each * scatter**2 * now[:, 3])
         & (radius * around.turn >= _ARC * search.spacing)
         & (now[:, 3] >= FEWEST)
     )
