@@ -69,11 +69,6 @@ def find_corners(search: Search, zones: Zones, fit: Fit, chosen: np.ndarray) -> 
         chosen: Which pairs are fillets, shape (P,), bool.
     """
     meeting = fillets_that_meet(zones.pairs, fit, chosen)
-    none = np.zeros(0, np.int64)
-    if len(meeting) == 0:
-        return Corners(
-            np.zeros((0, 3), np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3, 3)), none, none
-        )
     sides = np.sort(zones.pairs[meeting].reshape(-1, 4), axis=1)
     # Of four names one is there twice.
     twice = np.argmax(sides[:, 1:] == sides[:, :-1], axis=1)[:, None]
@@ -124,9 +119,7 @@ def _heights(search: Search, point: np.ndarray, patch: np.ndarray) -> tuple[np.n
     return side * far, side[:, None] * normal
 
 
-def _touching(
-    search: Search, start: np.ndarray, sides: np.ndarray, radius: np.ndarray
-) -> Corners:
+def _touching(search: Search, start: np.ndarray, sides: np.ndarray, radius: np.ndarray) -> Corners:
     """Return the balls that touch three sides, each once."""
     centre, many = start.copy(), len(start)
     none = np.zeros(0, np.int64)
@@ -146,22 +139,41 @@ def _touching(
     return Corners(sides[kept], centre[kept], radius[kept], toward, none, none)
 
 
+class _Around:
+    """Finds the points around places, of which there are few."""
+
+    def __init__(self, search: Search) -> None:
+        """Sort the boxes of the leaves along one axis."""
+        self.leaves = search.leaves
+        self.order = np.argsort(search.box[:, 0], kind="stable")
+        self.box = search.box[self.order]
+        self.wide = float((self.box[:, 3] - self.box[:, 0]).max(initial=0.0))
+
+    def points(self, place: np.ndarray, reach: float) -> np.ndarray:
+        """Return the points of the leaves within reach of a place."""
+        first = np.searchsorted(self.box[:, 0], place[0] - reach - self.wide)
+        last = np.searchsorted(self.box[:, 0], place[0] + reach, side="right")
+        box = self.box[first:last]
+        gap = np.maximum(np.maximum(box[:, :3] - place, place - box[:, 3:]), 0.0)
+        leaf = np.sort(self.order[first:last][np.einsum("ij,ij->i", gap, gap) <= reach**2])
+        return ranges(self.leaves.first[leaf], self.leaves.count[leaf])
+
+
 def _supported(search: Search, found: Corners) -> Corners:
     """Return the corners that points lie on, with these."""
-    box, noise = search.box, search.noise
+    around, noise = _Around(search), search.noise
     points, kept = [np.zeros(0, np.int64)], []
     for k, (sides, centre, radius, toward) in enumerate(zip(*found[:4], strict=True)):
         size = abs(radius)
-        gap = np.maximum(np.maximum(box[:, :3] - centre, centre - box[:, 3:]), 0.0)
-        leaf = np.flatnonzero(np.einsum("ij,ij->i", gap, gap) <= (1.0 + _NEAR) ** 2 * size**2)
-        point = ranges(search.leaves.first[leaf], search.leaves.count[leaf])
+        front = max(_NEAR * size, ON * noise)
+        point = around.points(centre, size + front)
         away = search.points[point] - centre
         far = np.linalg.norm(away, axis=1)
         off = np.abs(far - size)
         cosine = -np.sign(radius) * np.einsum("ij,ij->i", search.normals[point], away)
         cosine /= np.maximum(far, 1e-12)
         near = (away @ np.linalg.inv(toward) >= 0.0).all(axis=1) & (cosine > 0.0)
-        near &= off <= max(_NEAR * size, ON * noise)
+        near &= off <= front
         on = near & (off <= ON * noise) & (cosine >= np.cos(TURN))
         total, point, off = np.count_nonzero(near), point[on], off[on]
         if len(point) < max(FEWEST, _MOSTLY * total):
@@ -177,12 +189,12 @@ def _supported(search: Search, found: Corners) -> Corners:
             kept.append(k)
             points.append(point[(better | side)[of]])
     point, corner = listed(points[1:])
-    return Corners(*(part[kept] for part in found[:4]), point, corner)
+    return Corners(
+        found.sides[kept], found.centre[kept], found.radius[kept], found.toward[kept], point, corner
+    )
 
 
-def parts_of(
-    search: Search, zones: Zones, corners: Corners, strip_of: np.ndarray
-) -> Parts:
+def parts_of(search: Search, zones: Zones, corners: Corners, strip_of: np.ndarray) -> Parts:
     """Return the patches that corners and the fillets that meet there explain.
 
     Args:
@@ -205,7 +217,7 @@ def parts_of(
     for k, two in enumerate(([0, 1], [0, 2], [1, 2])):
         at = search.place(corners.sides[of][:, two], corners.radius[of], sample, owner)
         tube[:, k] = (at.region == BALL) & (np.abs(at.off) <= ON * search.noise)
-        tube[:, k] &= at.cosine >= np.cos(TURN)
+        tube[:, k] &= (at.cosine >= np.cos(TURN)) & ~on[sample]
     # A patch may lie between two corners.
     explained |= tube.any(axis=1)
     share = np.zeros(len(search.label), bool)
@@ -237,15 +249,14 @@ def parts_of(
 
 def mark_corners(search: Search, corners: Corners, edge: np.ndarray) -> None:
     """Mark the points of corners, and those of their sides beside them, as fillets, in place."""
+    if len(corners.radius) == 0:
+        return
     reach = EDGE * search.spacing
     touch = corners.centre[:, None] + np.abs(corners.radius)[:, None, None] * corners.toward
-    box = search.box
-    for sides, three in zip(corners.sides, touch, strict=True):
-        for side, place in zip(sides, three, strict=True):
-            gap = np.maximum(np.maximum(box[:, :3] - place, place - box[:, 3:]), 0.0)
-            leaf = np.flatnonzero(np.einsum("ij,ij->i", gap, gap) <= reach**2)
-            point = ranges(search.leaves.first[leaf], search.leaves.count[leaf])
-            point = point[search.label[point] == side]
-            far = np.linalg.norm(search.points[point] - place, axis=1)
-            edge[point[far <= reach]] = int(EdgeClass.FILLET)
+    around = _Around(search)
+    for side, place in zip(corners.sides.ravel(), touch.reshape(-1, 3), strict=True):
+        point = around.points(place, reach)
+        point = point[search.label[point] == side]
+        far = np.linalg.norm(search.points[point] - place, axis=1)
+        edge[point[far <= reach]] = int(EdgeClass.FILLET)
     edge[corners.point] = int(EdgeClass.FILLET)

@@ -25,6 +25,14 @@ WEAK = 2.0
 SLACK = 1.05
 """The radius of a fillet may be above the limit by so much: it is not known exactly."""
 
+FEWEST = 8
+"""A fillet, a corner have so many points."""
+WORSE, EVEN = 1.2, 0.3
+"""Points on a ball are no farther from it than from the surfaces of their patches, times the first,
+plus the second in noises."""
+FOREIGN = 0.25
+"""Beside the points of its sides, so large a share may be of patches that explain them better."""
+
 # Points of the zone of an edge that are looked at, that the radius is fitted to, and that radii are
 # tried on; each of these is larger than the last by the ratio.
 _MANY, _SOME, _FEW = 3000, 600, 150
@@ -41,17 +49,11 @@ _NEWTON = 6
 _GAIN, _EACH, _SCATTER, _EXPECTED = 40.0, (0.1, 0.25), 0.5, 0.5
 _STEEP = 2.5  # turns beyond this [rad] count as this one
 _ARC = 1.5  # a fillet is at least this wide [spacings]
-FEWEST = 8
 _SHARED = 2.0  # neighbours share some of their noise, and the sides are not known exactly
-# Its points are no farther from the ball than from the surfaces of their patches, times this, plus
-# so many noises.
-WORSE, EVEN = 1.2, 0.3
 # Where a ball explains all points they are no farther from it than points are from the surfaces of
 # their patches, times this.
 _ALIKE = 1.4
-# Beside the points of its sides, so large a share may be of patches that explain them better.
-FOREIGN = 0.25
-_FITS = 0.5  # ... and so much of the weight of its support is left, if it lies on another fillet
+_FITS = 0.5  # so much of the weight of the support of a ball is left, if it lies on another fillet
 _FRESH = 0.5  # ... and this share of its points is on no better one
 _STRIP_SHARE = 0.5  # a patch is the strip of a fillet when so much of it is claimed
 _REFIT = 300

@@ -6,9 +6,10 @@ only unknown. Balls that explain points which neither surface explains are fille
 supported first: each claims the points on it, and what is left has to support the next.
 
 A fillet has a radius of up to `EdgeParams.fillet_radius`, turns over at least two point spacings,
-and touches the surfaces on both of its sides. Where fillets meet, blends between them belong to no
-pair (`borders.blends`). A round joint that is larger is a patch like any other, and so are
-cylinders that touch nothing along their sides: bosses, holes.
+and touches the surfaces on both of its sides. Where fillets meet, the ball that touches three
+sides (`borders.corners`) and other blends (`borders.blends`) belong to no pair. A round joint that
+is larger is a patch like any other, and so are cylinders that touch nothing along their sides:
+bosses, holes.
 """
 
 from __future__ import annotations
@@ -40,8 +41,6 @@ from octoseg_ti.stages.profiles import BALL, FIRST, SECOND
 from octoseg_ti.stages.rims import Lines
 from octoseg_ti.types import NONE, EdgeClass
 
-# Rounds of claims; between them surfaces are fitted anew without what was claimed.
-_ROUNDS = 2
 _GIVEN = 0.15  # share of the points of a strip that its sides may get back, at most
 
 
@@ -77,21 +76,22 @@ def find_borders(search: Search, lines: Lines | None = None) -> Borders:
     zones = find_zones(search)
     around = look_around(search, zones)
     guess = guess_radii(search, zones, around)
-    chosen = np.zeros(0, bool)
-    for turn in range(_ROUNDS):
-        if turn:
-            corners = find_corners(search, zones, fit, chosen)
-            parts = parts_of(search, zones, corners, strip_pairs(search, zones, chosen))
-            refit_sides(search)
-            if parts.patch.any():
-                # They are no sides of fillets, but the tubes go on over them.
-                search.held[corners.point] = True
-                zones = find_zones(search, parts.strip)
-                around = look_around(search, zones)
-                radius, hope = guess_radii(search, zones, around)
-                guess = radius, hope & ~parts.patch[zones.pairs].any(axis=1)
-        fit = fit_balls(search, zones, around, guess, last=turn == _ROUNDS - 1)
-        chosen = claim_points(search, zones, fit)
+    fit = fit_balls(search, zones, around, guess, last=False)
+    chosen = claim_points(search, zones, fit)
+    # Once more, with surfaces fitted anew without what was claimed.
+    corners = find_corners(search, zones, fit, chosen)
+    parts = parts_of(search, zones, corners, strip_pairs(search, zones, chosen))
+    refit_sides(search)
+    if len(parts.strip):
+        # The tubes go on over patches that are parts of corners.
+        search.held[corners.point] = True
+        zones = find_zones(search, parts.strip)
+        around = look_around(search, zones)
+        guess = guess_radii(search, zones, around)
+    # Such patches are no sides of fillets.
+    guess = guess[0], guess[1] & ~parts.patch[zones.pairs].any(axis=1)
+    fit = fit_balls(search, zones, around, guess, last=True)
+    chosen = claim_points(search, zones, fit)
     fillets = np.flatnonzero(chosen)
     number = np.full(len(zones.pairs) + 1, NONE, np.int32)
     number[fillets] = np.arange(len(fillets), dtype=np.int32)
