@@ -82,9 +82,9 @@ def find_borders(search: Search, lines: Lines | None = None) -> Borders:
     corners = find_corners(search, zones, fit, chosen)
     parts = parts_of(search, zones, corners, strip_pairs(search, zones, chosen))
     refit_sides(search)
+    search.held[corners.point] = True
     if len(parts.strip):
         # The tubes go on over patches that are parts of corners.
-        search.held[corners.point] = True
         zones = find_zones(search, parts.strip)
         around = look_around(search, zones)
         guess = guess_radii(search, zones, around)
