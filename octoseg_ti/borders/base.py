@@ -90,14 +90,18 @@ def find_base(
     walls = count >= _FEWEST
     near = walls & (outer >= outer[walls].max() - _STEP * spacing)
     even = near & (outer - low < _EVEN * spacing)
+    # Where points end at any distance up to a spacing, the rest of them is beyond the quantile;
+    # but the largest of several quantiles is above their mean by about its error.
+    beyond = 1.0 - _OUTER - np.sqrt(_OUTER * (1.0 - _OUTER) / count)
+    outer = outer + np.where(even, 0.0, np.maximum(beyond, 0.0) * spacing)
     base = outer[near].max()
     if not (near & ~even).any():
         # No wall shows the plane itself; it is above the next stripe of each.
         base += 0.5 * max(outer[even].min() + spacing - base, 0.0)
     near &= np.bincount(of, np.abs(_along(facing, down))) / count < _SLOPE
     lowest = np.where(down > 0.0, box[:, 3:], box[:, :3])
-    beyond = _along(lowest, down).max() > base + _BELOW * spacing + _NOISES * noise
-    if np.count_nonzero(near) < _WALLS or beyond:
+    goes_on = _along(lowest, down).max() > base + _BELOW * spacing + _NOISES * noise
+    if np.count_nonzero(near) < _WALLS or goes_on:
         return None
     return Base(down, float(base), names[near])
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from octoseg_ti.borders.zones import CAP, Search, Zones, listed, points_of, tasks, thinned
+from octoseg_ti.borders.zones import CAP, TURN, Search, Zones, listed, points_of, tasks, thinned
 from octoseg_ti.stages.leaves import Samples
 from octoseg_ti.stages.marking import nearest_marked
 from octoseg_ti.stages.profiles import BALL, NOWHERE
@@ -25,6 +25,14 @@ WEAK = 2.0
 SLACK = 1.05
 """The radius of a fillet may be above the limit by so much: it is not known exactly."""
 
+FEWEST = 8
+"""A fillet, a corner have so many points."""
+WORSE, EVEN = 1.2, 0.3
+"""Points on a ball are no farther from it than from the surfaces of their patches, times the first,
+plus the second in noises."""
+FOREIGN = 0.25
+"""Beside the points of its sides, so large a share may be of patches that explain them better."""
+
 # Points of the zone of an edge that are looked at, that the radius is fitted to, and that radii are
 # tried on; each of these is larger than the last by the ratio.
 _MANY, _SOME, _FEW = 3000, 600, 150
@@ -34,24 +42,18 @@ _RATIO = 1.15
 _SKIP, _SURE = 4, 4.0
 _HOPE = 0.03  # share of the points that a radius has to explain beyond a sharp edge, to go on
 _NEWTON = 6
-_TURN = 0.5  # ... and its normal is that of the ball within this angle [rad]
-# A fillet gains at least this much over a sharp edge, in squares of the noise: in all, and for each
-# point on it: more than errors of the sides do, but no more than this share of what a ball of its
-# radius gains where the edge is shallow.
-_GAIN, _EACH, _EXPECTED = 40.0, (0.1, 0.25), 0.5
+# A fillet gains at least this much over a sharp edge: in all, in squares of the noise; and for each
+# point on it, in squares of how far points are from their surfaces, if this share of the noise and
+# more: more than errors of the sides do, but no more than this share of what a ball of its radius
+# gains where the edge is shallow.
+_GAIN, _EACH, _SCATTER, _EXPECTED = 40.0, (0.1, 0.25), 0.5, 0.5
 _STEEP = 2.5  # turns beyond this [rad] count as this one
 _ARC = 1.5  # a fillet is at least this wide [spacings]
-_FEWEST = 8
 _SHARED = 2.0  # neighbours share some of their noise, and the sides are not known exactly
-# Its points are no farther from the ball than from the surfaces of their patches, times this, plus
-# so many noises.
-_WORSE, _EVEN = 1.2, 0.3
 # Where a ball explains all points they are no farther from it than points are from the surfaces of
 # their patches, times this.
 _ALIKE = 1.4
-# Beside the points of its sides, so large a share may be of patches that explain them better.
-_FOREIGN = 0.25
-_FITS = 0.5  # ... and so much of the weight of its support is left, if it lies on another fillet
+_FITS = 0.5  # so much of the weight of the support of a ball is left, if it lies on another fillet
 _FRESH = 0.5  # ... and this share of its points is on no better one
 _STRIP_SHARE = 0.5  # a patch is the strip of a fillet when so much of it is claimed
 _REFIT = 300
@@ -131,7 +133,7 @@ def guess_radii(search: Search, zones: Zones, around: Around) -> tuple[np.ndarra
     total = task[:, 3] - task[:, 2]
     hope = (cost[:, 0] - cost.min(axis=1)) * unit > np.maximum(_HOPE * total, 1.0)
     # What the noise of few points hides may show among more.
-    unsure = ~hope & (total >= _FEWEST) & ~smooth_pairs(search, zones.pairs, around.turn)
+    unsure = ~hope & (total >= FEWEST) & ~smooth_pairs(search, zones.pairs, around.turn)
     again = np.flatnonzero(unsure)
     point, pair = around.thinned(_SOME)
     cost, _ = search.tried(
@@ -176,13 +178,14 @@ def fit_balls(
     gain = (none[:, 0] - now[:, 0]) / noise**2
     # The mean square of the distances from a ball to the sharp edge within it.
     wide = radius * (1.0 / np.cos(np.minimum(around.turn, _STEEP) / 2.0) - 1.0)
-    each = np.clip(_EXPECTED * wide**2 / (5.0 * noise**2), *_EACH)
+    scatter = float(np.clip(search.usual(), _SCATTER * noise, noise))
+    each = np.clip(_EXPECTED * wide**2 / (5.0 * scatter**2), *_EACH)
     rms = np.sqrt(now[:, 0] / total)
     rounded = hope & (
         (gain * around.every >= _GAIN * total)
-        & (gain >= each * now[:, 3])
+        & (gain * noise**2 >= each * scatter**2 * now[:, 3])
         & (radius * around.turn >= _ARC * search.spacing)
-        & (now[:, 3] >= _FEWEST)
+        & (now[:, 3] >= FEWEST)
     )
     small = radius <= SLACK * search.limit
     return Fit(
@@ -201,7 +204,7 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
     point, pair = points_of(search, zones, fit.good)
     at = search.place(zones.pairs, fit.radius, point, pair)
     on = (at.region == BALL) & (np.abs(at.off) <= ON * search.noise)
-    on &= at.cosine >= np.cos(_TURN)
+    on &= at.cosine >= np.cos(TURN)
     point, pair = point[on], pair[on]
     # What the surface of a patch explains better is no fillet: a chamfer, the next fillet.
     _, of = np.unique(
@@ -209,13 +212,13 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
     )
     number = np.bincount(of)
     ball, own = np.bincount(of, at.off[on] ** 2), np.bincount(of, search.off[point] ** 2)
-    better = ball <= _WORSE**2 * own + (_EVEN * search.noise) ** 2 * number
+    better = ball <= WORSE**2 * own + (EVEN * search.noise) ** 2 * number
     side = (search.label[point][:, None] == zones.pairs[pair]).any(axis=1)
     kept = better[of] | side
     pairs = len(zones.pairs)
     spared, wrong = kept & ~side, ~kept
     agree = np.bincount(pair, wrong, pairs) <= np.maximum(
-        np.bincount(pair, spared, pairs), _FOREIGN * np.bincount(pair, side, pairs)
+        np.bincount(pair, spared, pairs), FOREIGN * np.bincount(pair, side, pairs)
     )
     point, pair = point[kept], pair[kept]
     ends = np.searchsorted(pair, np.arange(pairs + 1))
@@ -226,7 +229,7 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
     search.claim[:] = NONE
     chosen, taken = np.zeros(pairs, bool), np.zeros(search.count, np.int64)
     for p in np.argsort(-support * quality, kind="stable"):
-        if support[p] < _FEWEST or not agree[p]:
+        if support[p] < FEWEST or not agree[p]:
             continue
         # The strip of another fillet is a side only of a ball that fits as well as surfaces do.
         strip = taken[zones.pairs[p]] >= _STRIP_SHARE * search.size[zones.pairs[p]]
@@ -234,7 +237,7 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
             continue
         mine = point[ends[p] : ends[p + 1]]
         fresh = mine[search.claim[mine] < 0]
-        if len(fresh) < max(_FRESH * len(mine), _FEWEST):
+        if len(fresh) < max(_FRESH * len(mine), FEWEST):
             continue
         search.claim[fresh] = p
         taken += np.bincount(search.label[fresh] + 1, minlength=search.count + 1)[1:]
@@ -316,6 +319,15 @@ def strips_of(search: Search, number: np.ndarray) -> np.ndarray:
     table = np.bincount(key, minlength=search.count * max(fillets, 1)).reshape(search.count, -1)
     most = table.sum(axis=1) >= np.maximum(_STRIP_SHARE * search.size, 1)
     return np.where(most, table.argmax(axis=1), NONE).astype(np.int32)
+
+
+def strip_pairs(search: Search, zones: Zones, chosen: np.ndarray) -> np.ndarray:
+    """Return the sides of the fillet that every patch is a strip of, -1 = none, shape (K, 2)."""
+    fillets = np.flatnonzero(chosen)
+    number = np.full(len(chosen) + 1, NONE, np.int32)
+    number[fillets] = np.arange(len(fillets), dtype=np.int32)
+    sides = np.append(zones.pairs[fillets], [[NONE, NONE]], axis=0)
+    return sides[strips_of(search, number)]
 
 
 def smooth_pairs(search: Search, pairs: np.ndarray, turn: np.ndarray) -> np.ndarray:

@@ -6,9 +6,10 @@ only unknown. Balls that explain points which neither surface explains are fille
 supported first: each claims the points on it, and what is left has to support the next.
 
 A fillet has a radius of up to `EdgeParams.fillet_radius`, turns over at least two point spacings,
-and touches the surfaces on both of its sides. Where fillets meet, blends between them belong to no
-pair (`borders.blends`). A round joint that is larger is a patch like any other, and so are
-cylinders that touch nothing along their sides: bosses, holes.
+and touches the surfaces on both of its sides. Where fillets meet, the ball that touches three
+sides (`borders.corners`) and other blends (`borders.blends`) belong to no pair. A round joint that
+is larger is a patch like any other, and so are cylinders that touch nothing along their sides:
+bosses, holes.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from octoseg_ti.borders.blends import find_blends, mark_blends
+from octoseg_ti.borders.corners import find_corners, mark_corners, parts_of
 from octoseg_ti.borders.fillets import (
     ON,
     WEAK,
@@ -28,6 +30,7 @@ from octoseg_ti.borders.fillets import (
     look_around,
     refit_sides,
     smooth_pairs,
+    strip_pairs,
     strips_of,
 )
 from octoseg_ti.borders.rims import mark_rims
@@ -38,8 +41,6 @@ from octoseg_ti.stages.profiles import BALL, FIRST, SECOND
 from octoseg_ti.stages.rims import Lines
 from octoseg_ti.types import NONE, EdgeClass
 
-# Rounds of claims; between them surfaces are fitted anew without what was claimed.
-_ROUNDS = 2
 _GIVEN = 0.15  # share of the points of a strip that its sides may get back, at most
 
 
@@ -75,16 +76,30 @@ def find_borders(search: Search, lines: Lines | None = None) -> Borders:
     zones = find_zones(search)
     around = look_around(search, zones)
     guess = guess_radii(search, zones, around)
-    for turn in range(_ROUNDS):
-        if turn:
-            refit_sides(search)
-        fit = fit_balls(search, zones, around, guess, last=turn == _ROUNDS - 1)
-        chosen = claim_points(search, zones, fit)
+    fit = fit_balls(search, zones, around, guess, last=False)
+    chosen = claim_points(search, zones, fit)
+    # Once more, with surfaces fitted anew without what was claimed.
+    corners = find_corners(search, zones, fit, chosen)
+    parts = parts_of(search, zones, corners, strip_pairs(search, zones, chosen))
+    refit_sides(search)
+    search.held[corners.point] = True
+    if len(parts.strip):
+        # The tubes go on over patches that are parts of corners.
+        zones = find_zones(search, parts.strip)
+        around = look_around(search, zones)
+        guess = guess_radii(search, zones, around)
+    # Such patches are no sides of fillets.
+    guess = guess[0], guess[1] & ~parts.patch[zones.pairs].any(axis=1)
+    fit = fit_balls(search, zones, around, guess, last=True)
+    chosen = claim_points(search, zones, fit)
     fillets = np.flatnonzero(chosen)
     number = np.full(len(zones.pairs) + 1, NONE, np.int32)
     number[fillets] = np.arange(len(fillets), dtype=np.int32)
     strip = strips_of(search, number)
-    edge = mark_points(search, zones, fit, chosen, strip)
+    corners = find_corners(search, zones, fit, chosen)
+    parts = parts_of(search, zones, corners, strip_pairs(search, zones, chosen))
+    edge = mark_points(search, zones, fit, chosen, strip, parts.smooth)
+    mark_corners(search, corners, edge)
     if lines is not None:
         mark_rims(search, lines, edge)
     sides = zones.pairs[fillets].astype(np.int32)
@@ -143,12 +158,26 @@ def give_back(
 
 
 def mark_points(
-    search: Search, zones: Zones, fit: Fit, chosen: np.ndarray, strip: np.ndarray
+    search: Search,
+    zones: Zones,
+    fit: Fit,
+    chosen: np.ndarray,
+    strip: np.ndarray,
+    joined: np.ndarray,
 ) -> np.ndarray:
-    """Return the `EdgeClass` of every point: that of the nearest edge within two spacings."""
+    """Return the `EdgeClass` of every point: that of the nearest edge within two spacings.
+
+    Args:
+        search: What is known.
+        zones: The pairs of patches.
+        fit: The balls of all pairs.
+        chosen: Which pairs are fillets, shape (P,), bool.
+        strip: Fillet that every patch is a strip of, -1 = none, shape (K,).
+        joined: Which pairs are known to join smoothly, shape (P,), bool.
+    """
     leaves, reach = search.leaves, EDGE * search.spacing
     radius = np.where(chosen, fit.radius, 1e-12 * fit.hollow)
-    smooth = smooth_pairs(search, zones.pairs, fit.turn) | fit.large | (fit.points < 5)
+    smooth = smooth_pairs(search, zones.pairs, fit.turn) | fit.large | (fit.points < 5) | joined
     smooth &= ~chosen
     idle = ~chosen & (strip[zones.pairs] >= 0).any(axis=1) & smooth
     # The leaves of the zones, and those that touch them.

@@ -21,6 +21,8 @@ from octoseg_ti.types import NONE, SurfaceKind
 
 CAP = 4.0
 """Distances beyond this many noises count as this many."""
+TURN = 0.5
+"""The normal of a point is that of the ball it lies on within this angle [rad]."""
 EDGE = 2.0
 """Edge points are this near an edge [spacings]."""
 
@@ -115,6 +117,8 @@ class Search:
         self.own = label_lists(leaves, label)
         self.near = near_lists(leaves, self.own)
         self.claim = np.full(len(label), NONE, np.int32)
+        # Points on the balls of corners, which say nothing about the tubes that end there.
+        self.held = np.zeros(len(label), bool)
         self.box = leaves.box
 
     def leaf_of(self, point: np.ndarray) -> np.ndarray:
@@ -283,12 +287,19 @@ def strips_between(search: Search, touching: np.ndarray) -> np.ndarray:
     return triple[(on >= fewest) & (on >= _MOSTLY * between)]
 
 
-def find_zones(search: Search) -> Zones:
-    """Return the pairs of patches that may share an edge, and where."""
+def find_zones(search: Search, strips: np.ndarray | None = None) -> Zones:
+    """Return the pairs of patches that may share an edge, and where.
+
+    Args:
+        search: What is known.
+        strips: Patches known to lie between two others, and these, shape (S, 3).
+    """
     pairs, leaf = pairs_near(search.near)
     width, cells = search.count + 1, len(search.leaves)
     touching = np.unique(pairs[:, 0].astype(np.int64) * width + pairs[:, 1])
     triple = strips_between(search, np.column_stack([touching // width, touching % width]))
+    if strips is not None:
+        triple = np.unique(np.concatenate([triple, strips]), axis=0)
     between, along = leaves_between(search, triple)
     # Large leaves are far inside a patch: their points say nothing about its edges.
     size = search.leaves.size
@@ -342,5 +353,5 @@ def points_of(search: Search, zones: Zones, which: np.ndarray) -> tuple[np.ndarr
     leaf, pair = zones.leaf[kept], zones.pair[kept]
     count = search.leaves.count[leaf]
     point, pair = ranges(search.leaves.first[leaf], count), np.repeat(pair, count)
-    kept = zones.allows(pair, search.label[point])
+    kept = zones.allows(pair, search.label[point]) & ~search.held[point]
     return point[kept], pair[kept]

@@ -17,20 +17,20 @@ class Rims(NamedTuple):
     label: np.ndarray
 
 
-def walls(lift: tuple[float, ...], rough: float, seed: int = 0) -> Rims:
+def walls(lift: tuple[float, ...], rough: float, seed: int = 0, many: int = 60) -> Rims:
     """The rims of the four walls of a box on the plane z = 0, some way above that plane each."""
     rng = np.random.default_rng(seed)
     parts = []
     for k, up in enumerate(lift):
-        along = rng.uniform(-10, 10, 60)
-        z = up + rough * rng.random(60) ** 2 + rng.normal(0, 0.005, 60)
+        along = rng.uniform(-10, 10, many)
+        z = up + rough * rng.random(many) ** 2 + rng.normal(0, 0.005, many)
         turn = np.pi / 2 * k
         normal = np.array([np.cos(turn), np.sin(turn), 0.0])
         side = np.array([-np.sin(turn), np.cos(turn), 0.0])
         point = 10 * normal + np.outer(along, side) + np.outer(z, -DOWN)
-        outward = DOWN + rng.normal(0, 0.05, (60, 1)) * side
+        outward = DOWN + rng.normal(0, 0.05, (many, 1)) * side
         outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-        parts.append((point, np.tile(normal, (60, 1)), outward, np.full(60, 5 + k)))
+        parts.append((point, np.tile(normal, (many, 1)), outward, np.full(many, 5 + k)))
     return Rims(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -53,6 +53,19 @@ def test_walls_with_ragged_rims_show_the_plane(seed: int) -> None:
     assert base is not None
     np.testing.assert_allclose(base.above(cloud), (cloud @ rotation)[:, 2], atol=0.12)
     np.testing.assert_array_equal(base.walls, [5, 6, 7, 8])
+
+
+def test_the_plane_is_neither_within_the_walls_nor_beyond_them() -> None:
+    # Stripes end at any distance up to a spacing from the plane.
+    heights = []
+    for seed in range(20):
+        rng = np.random.default_rng(100 + seed)
+        rims = walls((0.0,) * 4, 0.0, seed, many=400)
+        rims.point[:, 2] += rng.random(len(rims.point))
+        base = find_base(*rims, boxes(rims.point), 1.0)
+        assert base is not None
+        heights.append(base.above(np.zeros((1, 3)))[0])
+    assert abs(np.mean(heights)) < 0.02
 
 
 def test_where_all_rims_are_even_the_plane_is_above_the_next_stripe() -> None:

@@ -107,6 +107,7 @@ def test_points_beside_a_blend_are_marked_and_stray_ones_are_not() -> None:
         analytic=np.ones(2, bool),
         count=2,
         label=label,
+        held=np.zeros(len(label), bool),
         points=points,
         members=[np.flatnonzero(label == k) for k in (0, 1)],
         noise=0.002,

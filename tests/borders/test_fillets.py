@@ -84,6 +84,20 @@ def test_a_fillet_as_deep_as_the_noise_is_found_and_a_sharp_edge_is_none() -> No
     assert scores.edges["sharp"].f1 > 0.97
 
 
+def test_a_long_fillet_at_a_shallow_edge_is_found_and_none_where_it_is_sharp() -> None:
+    # The ball leaves the planes by 0.06 mm at most, a third of the distance within which a point
+    # may lie on either.
+    scanner = StripeScanner(stripe_pitch=0.25, range_noise=0.05)
+    for radius in (1.2, 0.0):
+        scans, truth = simulate(bend(radius, 36.0, fillet=True, wide=16.0), scanner, seed=3)
+        result = segment(scans)
+        assert result.fillets is not None and len(result.fillets) == (radius > 0.0)
+        scores = evaluate(result, truth)
+        assert scores.edges["sharp"].f1 > 0.97
+        if radius > 0.0:
+            assert scores.edges["fillet"].f1 > 0.97
+
+
 def test_two_planes_with_a_large_cylinder_between_them_meet_smoothly() -> None:
     # Noise hides the cylinder, whose points go to the planes.
     result, truth, scores = ridge(12.0, 14.0, 0.025)
