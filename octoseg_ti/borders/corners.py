@@ -172,7 +172,9 @@ def _supported(search: Search, found: Corners) -> Corners:
         off = np.abs(far - size)
         cosine = -np.sign(radius) * np.einsum("ij,ij->i", search.normals[point], away)
         cosine /= np.maximum(far, 1e-12)
-        near = (away @ np.linalg.inv(toward) >= 0.0).all(axis=1) & (cosine > 0.0)
+        # No product of matrices: its sums may depend on the threads.
+        share = np.einsum("ij,jk->ik", away, np.linalg.inv(toward))
+        near = (share >= 0.0).all(axis=1) & (cosine > 0.0)
         near &= off <= front
         on = near & (off <= ON * noise) & (cosine >= np.cos(TURN))
         total, point, off = np.count_nonzero(near), point[on], off[on]

@@ -178,7 +178,7 @@ def fit_balls(
     gain = (none[:, 0] - now[:, 0]) / noise**2
     # The mean square of the distances from a ball to the sharp edge within it.
     wide = radius * (1.0 / np.cos(np.minimum(around.turn, _STEEP) / 2.0) - 1.0)
-    scatter = float(np.clip(search.usual(), _SCATTER * noise, noise))
+    scatter = float(np.clip(search.usual, _SCATTER * noise, noise))
     each = np.clip(_EXPECTED * wide**2 / (5.0 * scatter**2), *_EACH)
     rms = np.sqrt(now[:, 0] / total)
     rounded = hope & (
@@ -195,7 +195,7 @@ def fit_balls(
         turn=around.turn,
         points=task[:, 3] - task[:, 2],
         good=rounded & small,
-        large=rounded & ~small & (rms <= _ALIKE * search.usual()),
+        large=rounded & ~small & (rms <= _ALIKE * search.usual),
     )
 
 
@@ -225,7 +225,7 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
     support = np.diff(ends)
     # A ball that explains its points as well as surfaces do theirs goes before one that does not.
     square = np.bincount(pair, at.off[on][kept] ** 2, pairs) / np.maximum(support, 1)
-    quality = np.clip(2.0 - square / max(search.usual() ** 2, 1e-12), 0.1, 1.0)
+    quality = np.clip(2.0 - square / max(search.usual**2, 1e-12), 0.1, 1.0)
     search.claim[:] = NONE
     chosen, taken = np.zeros(pairs, bool), np.zeros(search.count, np.int64)
     for p in np.argsort(-support * quality, kind="stable"):

@@ -35,7 +35,8 @@ from octoseg_ti.borders.fillets import (
 )
 from octoseg_ti.borders.rims import mark_rims
 from octoseg_ti.borders.zones import CAP, EDGE, Search, Zones, find_zones, ranges
-from octoseg_ti.device.surfaces import evaluate_surfaces
+from octoseg_ti.device.surfaces import distances_to_surfaces, evaluate_surfaces
+from octoseg_ti.stages.leaves import distinct
 from octoseg_ti.stages.marking import nearest_marked
 from octoseg_ti.stages.profiles import BALL, FIRST, SECOND
 from octoseg_ti.stages.rims import Lines
@@ -191,7 +192,7 @@ def mark_points(
             np.repeat(near_pair, around) * len(leaves) + beside,
         ]
     )
-    key = np.unique(key)
+    key = distinct(key)
     pair, leaf = key // len(leaves), key % len(leaves)
     pair, leaf = pair[~idle[pair]], leaf[~idle[pair]]
     box = search.box
@@ -205,22 +206,32 @@ def mark_points(
     point = ranges(leaves.first[leaf], count)
     pair, leaf = np.repeat(pair, count), np.repeat(leaf, count)
     label = search.label[point]
-    ours = (label[:, None] == zones.pairs[pair]).any(axis=1)
+    first, second = zones.pairs[pair, 0], zones.pairs[pair, 1]
+    ours = (label == first) | (label == second)
+    # An edge lies on both surfaces: what is far from the other one is far from the edge.
+    sharp = np.flatnonzero(ours & ~(smooth | chosen)[pair])
+    other = np.where(label == first, second, first)
+    kind, parameters = search.table[:, 8].astype(np.int32), search.table[:, :8]
+    off = distances_to_surfaces(search.points[point[sharp]], other[sharp], kind, parameters)
+    ours[sharp] = np.abs(off) <= reach
     ours |= chosen[pair] & zones.allows(pair, label)
-    point, pair, leaf, label = point[ours], pair[ours], leaf[ours], label[ours]
-    at = search.place(zones.pairs, radius, point, pair)
-    tangent = smooth[pair]
-    along = np.where(tangent, 0.0, at.along)
+    point, pair, leaf, label, other = (a[ours] for a in (point, pair, leaf, label, other))
+    # A smooth joint has no line.
+    near, along = smooth[pair], np.zeros(len(point))
+    lined = np.flatnonzero(~near)
+    at = search.place(zones.pairs, radius, point[lined], pair[lined])
     ball = at.region == BALL
-    fits = (np.abs(at.off) <= np.where(ball, ON, CAP) * search.noise) | (ball & ~chosen[pair])
-    near = (along <= reach) & (fits | tangent)
-    point, pair, leaf, label = point[near], pair[near], leaf[near], label[near]
-    along = along[near]
-    other = np.where(label == zones.pairs[pair, 0], zones.pairs[pair, 1], zones.pairs[pair, 0])
+    fits = np.abs(at.off) <= np.where(ball, ON, CAP) * search.noise
+    fits |= ball & ~chosen[pair[lined]]
+    near[lined], along[lined] = (at.along <= reach) & fits, at.along
+    point, pair, leaf, other, along = (a[near] for a in (point, pair, leaf, other, along))
     found = np.ones(len(point), bool)
     far = np.where(smooth[pair], reach - 0.5 * search.spacing, along + reach)
     # A small leaf that holds the other label needs no search.
-    held = (search.own[leaf] == other[:, None]).any(axis=1) & (2.0 * wide[leaf] <= far)
+    held = np.zeros(len(point), bool)
+    for own in search.own.T:
+        held |= own[leaf] == other
+    held &= 2.0 * wide[leaf] <= far
     for k, marks, wanted in (
         (np.flatnonzero(~chosen[pair] & ~held), search.label, other),
         (np.flatnonzero(chosen[pair]), search.claim, pair),
@@ -232,7 +243,7 @@ def mark_points(
     point, pair, along = point[found], pair[found], along[found]
     code = np.full(len(zones.pairs), int(EdgeClass.SHARP), np.uint8)
     code[smooth], code[chosen] = int(EdgeClass.SMOOTH), int(EdgeClass.FILLET)
-    # A smooth joint has no line; what is nearer to another edge belongs to that.
+    # What is nearer to another edge than to a smooth joint belongs to that.
     order = np.argsort(-np.where(smooth[pair], reach, along), kind="stable")
     edge = np.zeros(len(search.points), np.uint8)
     edge[point[order]] = code[pair[order]]

@@ -14,7 +14,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.surfaces import distances_to_surfaces, evaluate_surfaces
 from octoseg_ti.stages.extraction import Surfaces
 from octoseg_ti.stages.labelling import label_lists, near_lists
-from octoseg_ti.stages.leaves import Leaves, members_of
+from octoseg_ti.stages.leaves import Leaves, distinct, members_of
 from octoseg_ti.stages.profiles import BALL, NOWHERE, Places, place, sums
 from octoseg_ti.stages.sets import spread
 from octoseg_ti.types import NONE, SurfaceKind
@@ -114,6 +114,9 @@ class Search:
             points, own, self.table[:, 8].astype(np.int32), self.table[:, :8]
         )
         self.off = np.minimum(np.abs(far), CAP * noise)
+        off = self.off[label >= 0]
+        # How far points are from the surfaces of their patches [mm].
+        self.usual = float(np.sqrt(np.mean(off**2))) if len(off) else noise
         self.own = label_lists(leaves, label)
         self.near = near_lists(leaves, self.own)
         self.claim = np.full(len(label), NONE, np.int32)
@@ -168,11 +171,6 @@ class Search:
     def absorbed(self) -> float:
         """Return how wide a piece of a fillet may pass as a part of the surface beside it [mm]."""
         return float(np.sqrt(2.0 * CAP * self.noise * self.limit)) + 1.5 * self.spacing
-
-    def usual(self) -> float:
-        """Return how far points are from the surfaces of their patches [mm]."""
-        off = self.off[self.label >= 0]
-        return float(np.sqrt(np.mean(off**2))) if len(off) else self.noise
 
     def ball_radii(self) -> np.ndarray:
         """Return the radius of the ball that touches every patch along a line [mm], shape (K,).
@@ -312,8 +310,11 @@ def find_zones(search: Search, strips: np.ndarray | None = None) -> Zones:
             (triple[between, 1] * width + triple[between, 2]) * cells + along,
         ]
     )
-    key = np.unique(key)
-    code, which = np.unique(key // cells, return_inverse=True)
+    key = distinct(key)
+    part = key // cells
+    new = np.ones(len(part), bool)
+    new[1:] = part[1:] != part[:-1]
+    code, which = part[new], np.cumsum(new) - 1
     pairs = np.column_stack([code // width, code % width])
     fine = small[key % cells]
     fine |= (np.bincount(which, fine, len(code)) == 0)[which]
