@@ -321,18 +321,28 @@ class _Search:
         return np.where(moved, 1.0, runtime.download(off)[:, 0]).astype(np.float32)
 
     def give_up_slivers(self) -> None:
-        """Give up small surfaces that were cut out of the ragged rim of something else."""
-        label = self.label
-        size = np.bincount(label[label >= 0], minlength=len(self.surfaces))
+        """Give up small surfaces that were cut out of something else, or that only normals hold.
+
+        Next to an edge normals are those of both sides, and do not tell. A surface is there when
+        its points are nearer to it than to what they would choose next, whichever way that faces.
+        """
+        label, count = self.label, len(self.surfaces)
+        size = np.bincount(label[label >= 0], minlength=count)
         small = size < FREE * self.tolerance.points
         here = np.flatnonzero(np.append(small, False)[label])
         if len(here) == 0:
             return
         point, name = runtime.download(self.grid.point)[here], label[here]
         far, _ = evaluate_surfaces(point, name, self.surfaces.kind, self.surfaces.parameters)
-        gone = cut_out(name, far / self.tolerance.noise, len(size))
+        gone, square = cut_out(name, far / self.tolerance.noise, count)
+        chosen, second, off = (runtime.download(a)[here] for a in self.labelling.choice)
+        # Where its surroundings decided, a point would choose next what it chose itself.
+        moved = name != chosen
+        second, off[moved, 0] = np.where(moved, chosen, second), 1.0
+        second = np.where(np.append(gone, False)[second], NONE, second)
+        gone |= explained_by_others(name, second, off, count, EXPLAINED * square)
         if gone.any():
-            self.rename(np.where(gone, NONE, np.arange(len(gone))))
+            self.rename(np.where(gone, NONE, np.arange(count)))
             self.choose()
 
 
