@@ -156,9 +156,13 @@ def round_between(
         product = np.einsum("rk,k->r", depth, inside[near])
         square = np.einsum("rk,rk->r", depth, depth)
         k = int(np.argmax(2.0 * product - square))
-        best, gain, share = radii[k], 2.0 * product[k] - square[k], product[k] / square[k]
+        best, gain, agrees = (
+            radii[k],
+            2.0 * product[k] - square[k],
+            product[k] >= _AGREES * square[k],
+        )
         radii = np.linspace(radii[max(k - 1, 0)], radii[min(k + 1, _RADII - 1)], _RADII)
-    if gain < _GAIN * noise**2 or share < _AGREES:
+    if gain < _GAIN * noise**2 or not agrees:
         return None
     there = np.zeros(len(point), bool)
     there[near] = np.abs(x[near]) <= best * sine

@@ -84,6 +84,15 @@ def test_rounds_below_the_limit_are_edges() -> None:
     assert len(hidden_rounds(samples, label, surfaces, PAIRS, noise=NOISE, limit=14.0)[0]) == 0
 
 
+def test_planes_without_points_at_their_edge_have_no_round() -> None:
+    point, label, surfaces, x = edge(14.0, hollow=False, seed=3)
+    far = np.abs(x) > 8.0
+    samples = samples_of(point[far], np.zeros_like(point[far]))
+    with np.errstate(all="raise"):
+        new, _, on = hidden_rounds(samples, label[far], surfaces, PAIRS, noise=NOISE, limit=3.0)
+    assert len(new) == 0 and np.all(on == -1)
+
+
 def test_rounds_follow_their_planes() -> None:
     point, label, surfaces, x = edge(12.0, hollow=False, seed=2)
     samples = samples_of(point, np.zeros_like(point))
