@@ -16,7 +16,8 @@ from octoseg_ti.arrange import Arranged
 from octoseg_ti.device import runtime
 from octoseg_ti.patches import Regions
 from octoseg_ti.stages.grid import Grid
-from octoseg_ti.stages.leaves import leaf_graph, sample_leaves
+from octoseg_ti.stages.leaves import members_of
+from octoseg_ti.stages.sets import spread
 from octoseg_ti.stages.sight import blocked_lines
 from octoseg_ti.types import NONE
 
@@ -80,17 +81,12 @@ def _mirrored(
     asked = (seen.max(axis=1, initial=0) >= _ONE_VIEW * size) & (size < size.max(initial=0))
     if not asked.any():
         return asked
-    graph = found.graph or leaf_graph(grid, leaves.astype(np.int32), found.touching)
-    rest = np.where(np.append(asked, False)[label], NONE, 0).astype(np.int32)
-    chosen = sample_leaves(grid, graph, 1, label=rest).index
+    # Of every region a few points, evenly: leaves are small along its rim, and lines of sight there
+    # pass close by what hides the rest of the face.
+    inside = np.flatnonzero(np.append(asked, False)[label])
+    few = [spread(members, _LINES) for members in members_of(label[inside], regions)]
+    chosen = inside[np.concatenate(few)]
     chosen = chosen[np.isfinite(probe[run[order[chosen]]]).all(axis=1)]
-    own = label[chosen]
-    # A few of every region, evenly.
-    rising = np.argsort(own, kind="stable")
-    count = np.bincount(own, minlength=regions)
-    rank = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
-    few = rank % np.maximum(1, -(-count // _LINES))[own[rising]] == 0
-    chosen = chosen[rising[few]]
     own = label[chosen]
     finest = grid.size / 2.0**grid.depth
     blocked = blocked_lines(

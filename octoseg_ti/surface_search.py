@@ -39,6 +39,7 @@ from octoseg_ti.stages.merging import (
     merge_surfaces,
     smooth_contacts,
 )
+from octoseg_ti.stages.rounds import hidden_rounds, refitted_rounds
 from octoseg_ti.stages.sets import Surfaces, fit_sets, flat_sets, lie_on, no_surfaces, spread
 from octoseg_ti.stages.settling import DOUBT, settle
 from octoseg_ti.types import NONE, SurfaceKind
@@ -90,8 +91,11 @@ class Surfaced:
 class _Search:
     """What the rounds of the search share."""
 
-    def __init__(self, grid: Grid, leaves: Leaves, tolerance: Tolerance, rule: Rule) -> None:
+    def __init__(
+        self, grid: Grid, leaves: Leaves, tolerance: Tolerance, rule: Rule, limit: float = 0.0
+    ) -> None:
         self.grid, self.leaves, self.tolerance = grid, leaves, tolerance
+        self.limit = limit
         self.samples = sample_leaves(grid, leaves, _SAMPLES)
         self.surfaces = no_surfaces()
         self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
@@ -102,6 +106,9 @@ class _Search:
         self.apart = np.zeros(0, np.int64)
         # Surfaces found in what others left have to be clearly better where others fit.
         self.early = 0
+        # Pairs of surfaces that meet smoothly. The last surfaces are rounds between these sides,
+        # which only all of their points prove.
+        self.meeting = self.sides = np.zeros((0, 2), np.int64)
         # Leaves of free forms choose nothing. What fits nothing there, or on a face that was cut
         # out of a group, is no group of its own.
         self.free = np.zeros(len(leaves), bool)
@@ -165,16 +172,19 @@ class _Search:
                 self.face[samples.leaf[members]] |= not apart
         if len(new) == 0:
             return False
-        base = len(self.surfaces)
-        self.surfaces = self.surfaces.joined(new)
+        self.join(new, samples.leaf, label)
+        return True
+
+    def join(self, new: Surfaces, leaf: np.ndarray, label: np.ndarray) -> None:
+        """Take new surfaces in, with those, -1 = none, that lie in some leaves."""
         there = label >= 0
         cell, rank = np.nonzero(self.own >= 0)
         self.own = own_lists(
             self.leaves,
-            np.concatenate([cell, samples.leaf[there]]),
-            np.concatenate([self.own[cell, rank], label[there] + base]),
+            np.concatenate([cell, leaf[there]]),
+            np.concatenate([self.own[cell, rank], label[there] + len(self.surfaces)]),
         )
-        return True
+        self.surfaces = self.surfaces.joined(new)
 
     def refit(self) -> None:
         """Fit the surfaces anew to the samples that chose them."""
@@ -225,12 +235,20 @@ class _Search:
         kind, parameters = self.surfaces.kind.copy(), self.surfaces.parameters.copy()
         # Some points of the next surface can bend a plane.
         many = np.array([len(s) >= _FEWEST for s in sets], bool)
+        many[count - len(self.sides) :] = False
         curved = np.flatnonzero((kind != SurfaceKind.PLANE) & many)
         flat, planes = flat_sets(both, [sets[k] for k in curved], noise)
         kind[curved[flat]], parameters[curved[flat]] = SurfaceKind.PLANE, planes[flat]
         point = both.point[np.concatenate([np.zeros(0, np.int64), *sets])]
         start = np.cumsum([0] + [len(s) for s in sets])
-        parameters = refine(point, start, kind, parameters, noise=noise)
+        refined = refine(point, start, kind, parameters, noise=noise)
+        base = count - len(self.sides)
+        refined[base:] = parameters[base:]
+        # So few degrees tell no radius alone: the planes beside a round do.
+        parameters = refitted_rounds(
+            self.samples, label[self.samples.index], refined, self.sides,
+            noise=noise, limit=self.limit,
+        )  # fmt: skip
         self.surfaces = Surfaces(kind=kind, parameters=parameters)
         return covariances(point, start, kind, parameters)
 
@@ -280,6 +298,7 @@ class _Search:
         """Merge surfaces that are one; say whether there were any."""
         label = self.label[self.samples.index]
         pairs = smooth_contacts(self.leaves, self.own, self.samples, self.surfaces)
+        self.meeting = pairs
         key = pairs[:, 0] * len(self.surfaces) + pairs[:, 1]
         name, self.surfaces = merge_surfaces(
             self.samples,
@@ -306,12 +325,21 @@ class _Search:
             off[:, 1] * self.labelling.rule.tilt <= self.labelling.rule.turn, second, NONE
         )
         gone = explained_by_others(self.label, second, off, len(self.surfaces), EXPLAINED)
+        gone[len(gone) - len(self.sides) :] = False
         if not gone.any():
             return False
         name = np.where(gone, NONE, np.arange(len(gone)))
         self.rename(name)
         self.choose()
         return True
+
+    def add_rounds(self) -> None:
+        """Add the rounds between planes that noise hides."""
+        new, self.sides, on = hidden_rounds(
+            self.samples, self.label[self.samples.index], self.surfaces, self.meeting,
+            noise=self.tolerance.noise, limit=self.limit,
+        )  # fmt: skip
+        self.join(new, self.samples.leaf, on)
 
     def off_next(self) -> np.ndarray:
         """Return how far every point is from the surface that would be next [noises]."""
@@ -321,18 +349,28 @@ class _Search:
         return np.where(moved, 1.0, runtime.download(off)[:, 0]).astype(np.float32)
 
     def give_up_slivers(self) -> None:
-        """Give up small surfaces that were cut out of the ragged rim of something else."""
-        label = self.label
-        size = np.bincount(label + 1, minlength=len(self.surfaces) + 1)[1:]
+        """Give up small surfaces that were cut out of something else, or that only normals hold.
+
+        Next to an edge normals are those of both sides, and do not tell. A surface is there when
+        its points are nearer to it than to what they would choose next, whichever way that faces.
+        """
+        label, count = self.label, len(self.surfaces)
+        size = np.bincount(label + 1, minlength=count + 1)[1:]
         small = size < FREE * self.tolerance.points
         here = np.flatnonzero(np.append(small, False)[label])
         if len(here) == 0:
             return
         point, name = runtime.download(self.grid.point)[here], label[here]
         far, _ = evaluate_surfaces(point, name, self.surfaces.kind, self.surfaces.parameters)
-        gone = cut_out(name, far / self.tolerance.noise, len(size))
+        gone, square = cut_out(name, far / self.tolerance.noise, count)
+        chosen, second, off = (runtime.download(a)[here] for a in self.labelling.choice)
+        # Where its surroundings decided, a point would choose next what it chose itself.
+        moved = name != chosen
+        second, off[moved, 0] = np.where(moved, chosen, second), 1.0
+        second = np.where(np.append(gone, False)[second], NONE, second)
+        gone |= explained_by_others(name, second, off, count, EXPLAINED * square)
         if gone.any():
-            self.rename(np.where(gone, NONE, np.arange(len(gone))))
+            self.rename(np.where(gone, NONE, np.arange(count)))
             self.choose()
 
 
@@ -345,6 +383,7 @@ def find_surfaces(
     rule: Rule,
     *,
     narrow: bool,
+    limit: float,
 ) -> Surfaced:
     """Find the analytic surfaces of a part, and the surface of every point.
 
@@ -357,8 +396,9 @@ def find_surfaces(
         tolerance: What counts as lying on a surface.
         rule: What a point may differ from the surface that it takes.
         narrow: Positions are so exact that they tell narrow faces, whose normals do not.
+        limit: Rounds with smaller radii are edges, and no surfaces [mm].
     """
-    search = _Search(grid, leaves, tolerance, rule)
+    search = _Search(grid, leaves, tolerance, rule, limit)
     samples = search.samples
     search.add(samples, _sets_of(samples, leaves, group, tolerance.points))
     if search.free.any():
@@ -386,6 +426,7 @@ def find_surfaces(
         merged = search.merge()
         if not search.give_up() and not merged:
             break
+    search.add_rounds()
     search.early = len(search.surfaces)
     search.choose()
     covariance = search.refit_settled()

@@ -50,6 +50,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
     surfaced = find_surfaces(
         grid, graph, found.group[leaves], found.cut[leaves],
         Tolerance(noise, turn, fewest, exact), rule, narrow=exact,
+        limit=params.edges.fillet_radius,
     )  # fmt: skip
     gap = params.normals.gap
     near = graph if gap is None else without_gaps(graph, PIECE_GAPS * gap)

@@ -57,6 +57,19 @@ def test_what_is_seen_through_a_hole_stays() -> None:
     assert (result.labels[floor] >= 0).mean() > 0.9 and result.patch_count == 2
 
 
+def test_a_face_that_its_view_just_sees_stays() -> None:
+    """Lines of sight to its rims pass close by the edges of what hides the rest of it."""
+    slot = blocks.box((-3.7, -11.0, 8.0), (3.7, 11.0, 13.0))
+    part = blocks.difference(blocks.box((-15.0, -10.0, 0.0), (15.0, 10.0, 12.0)), slot)
+    views = (View(), *(View(tilt=math.radians(61.0), azimuth=turn) for turn in (0.0, math.pi)))
+    scanner = StripeScanner(stripe_pitch=0.25, range_noise=0.0, views=views)
+    scans, truth = simulate(part, scanner, seed=0)
+    result = segment(scans)
+    assert result.outlier.mean() < 0.001
+    regions = evaluate(result, truth).regions
+    assert regions.correct == regions.patches == regions.regions == 7
+
+
 @pytest.mark.parametrize("why", ["unknown place", "never asked", "one place for a view"])
 def test_without_a_place_of_the_probe_nothing_is_given_up(why: str) -> None:
     scans, image = scene(6.0, hole=False)

@@ -186,3 +186,21 @@ def test_the_ragged_rim_of_a_shadow_is_no_surface() -> None:
     height -= 0.072 * np.clip(29 - far, 0, None) * (1.0 + 0.5 * drop) * (x < 80)
     result = segment(stripes(height, 0.5, 1, 0.05))
     assert result.kind.tolist() == [SurfaceKind.PLANE]
+
+
+def test_a_shallow_round_that_noise_hides_is_a_patch() -> None:
+    """No point of it is beyond doubt on either plane; all of them together are."""
+    half, radius, step = 0.13, 14.0, 0.25
+    x = step * (np.indices((200, 120))[1] - 60)
+    wide = radius * np.sin(half)
+    ball = radius / np.cos(half) - np.sqrt(np.maximum(radius**2 - x**2, 0.0))
+    bent = np.where(abs(x) < wide, ball, abs(x) * np.tan(half))
+    result = segment(stripes(-bent, step, 0, 0.05))
+    kinds = [SurfaceKind.PLANE, SurfaceKind.PLANE, SurfaceKind.CYLINDER]
+    assert result.kind.tolist() == kinds
+    there = abs(x.ravel()) < wide
+    assert np.mean(result.labels[there] == 2) > 0.9
+    assert np.mean(there[result.labels == 2]) > 0.9
+    assert abs(result.parameters[2, 6] / radius - 1.0) < 0.1
+    sharp = segment(stripes(-abs(x) * np.tan(half), step, 0, 0.05))
+    assert sharp.kind.tolist() == [SurfaceKind.PLANE] * 2

@@ -162,7 +162,7 @@ def _residuals(
 
 
 def explained_by_others(
-    label: np.ndarray, second: np.ndarray, off: np.ndarray, count: int, limit: float
+    label: np.ndarray, second: np.ndarray, off: np.ndarray, count: int, limit: float | np.ndarray
 ) -> np.ndarray:
     """Return which surfaces their neighbours explain nearly as well.
 
@@ -175,7 +175,7 @@ def explained_by_others(
         second: The surface that each point would choose next, -1 = none, shape (n,), i32.
         off: Distance from that surface [noises], and angle to its normal [tilts], shape (n, 2).
         count: Number of surfaces M.
-        limit: Largest mean square of these distances.
+        limit: Largest mean square of these distances; one for all, or one each, shape (M,).
 
     Returns:
         Which surfaces to give up, shape (M,), bool: the smallest first, and none that one given up
@@ -187,6 +187,7 @@ def explained_by_others(
     alone = size - np.bincount(mine, minlength=count)
     far, deviation = mean_squares(mine, near[:, 0], (_CAP, 2.0 * _FORM), size, alone)
     (turn,) = mean_squares(mine, near[:, 1], (2.0 * _SMOOTH,), size, alone)
+    near_enough = far <= limit
     given_up = np.zeros(count, bool)
     leaned_on = np.zeros(count, bool)
     pair, points = _pairs(mine, other, alone, count)
@@ -204,14 +205,14 @@ def explained_by_others(
             and size[m] <= _SMALL * size[main]
         )
         heirs = heir[points[lo:hi] * 5 >= size[m]]
-        if (far[m] > limit and not form) or given_up[heirs].any():
+        if not (near_enough[m] or form) or given_up[heirs].any():
             continue
         given_up[m] = True
         leaned_on[heirs] = True
     return given_up
 
 
-def cut_out(label: np.ndarray, far: np.ndarray, count: int) -> np.ndarray:
+def cut_out(label: np.ndarray, far: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return which surfaces were cut out of something else as far as that just fitted.
 
     Args:
@@ -220,11 +221,12 @@ def cut_out(label: np.ndarray, far: np.ndarray, count: int) -> np.ndarray:
         count: Number of surfaces M.
 
     Returns:
-        Shape (M,), bool: those whose points leave more than noise does.
+        Shape (M,), bool: those whose points leave more than noise does; and the mean squares that
+        all leave, shape (M,).
     """
-    square = np.rint(_UNIT * far**2)  # whole units add up alike in any order
     size = np.bincount(label, minlength=count)
-    return np.bincount(label, square, count) > _UNIT * _CUT_OUT**2 * size
+    (square,) = mean_squares(label, far, (_CAP,), size, np.zeros_like(size))
+    return square > _CUT_OUT**2, square
 
 
 def _pairs(

@@ -171,5 +171,15 @@ def test_what_was_cut_out_leaves_more_than_noise(seed: int) -> None:
     label = np.repeat([0, 1, 3, 4], 60).astype(np.int32)
     order = rng.permutation(len(far))
     limited = np.where(np.abs(far) <= 2.5, far, 0.0)
-    found = cut_out(label[order], limited[order], 6)
+    found, square = cut_out(label[order], limited[order], 6)
     assert found.tolist() == [False, True, False, False, True, False]
+    plain = [np.mean(limited[label == m] ** 2) if np.any(label == m) else 0.0 for m in range(6)]
+    np.testing.assert_allclose(square, plain, atol=1e-3)
+
+
+def test_each_surface_may_have_a_limit_of_its_own() -> None:
+    label = np.repeat([0, 1, 2], [400, 40, 40]).astype(np.int32)
+    second = np.where(label == 0, -1, 0).astype(np.int32)
+    off = np.tile(np.float32([1.0, 9.0]), (480, 1))  # near, but facing another way
+    gone = explained_by_others(label, second, off, 3, np.array([0.0, 0.9, 1.1]))
+    assert gone.tolist() == [False, False, True]
