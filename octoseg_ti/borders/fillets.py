@@ -242,8 +242,17 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
         search.claim[fresh] = p
         taken += np.bincount(search.label[fresh] + 1, minlength=search.count + 1)[1:]
         chosen[p] = True
+    had = claims_of(search, pairs)
     drop_weak_claims(search, zones, fit)
-    return chosen
+    # Of a fillet that is none nothing is left but what the noise moved off the sides.
+    lost = claims_of(search, pairs) < np.maximum(_FRESH * had, FEWEST)
+    search.claim[np.append(lost, False)[search.claim]] = NONE
+    return chosen & ~lost
+
+
+def claims_of(search: Search, pairs: int) -> np.ndarray:
+    """Return how many points every pair has claimed, shape (pairs,)."""
+    return np.bincount(search.claim + 1, minlength=pairs + 1)[1:]
 
 
 def drop_weak_claims(search: Search, zones: Zones, fit: Fit) -> None:

@@ -15,6 +15,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.evaluation import Scores
 from octoseg_ti.types import NONE, EdgeClass, Segmentation, Truth
 from scanner_sim import StripeScanner, simulate
+from scanner_sim.random_blocks import random_block
 
 
 def ridge(radius: float, turn: float, noise: float) -> tuple[Segmentation, Truth, Scores]:
@@ -107,3 +108,12 @@ def test_two_planes_with_a_large_cylinder_between_them_meet_smoothly() -> None:
     middle &= truth.position[:, 2] > -2.0
     assert not np.any(result.edge[middle] == EdgeClass.SHARP)
     assert scores.edges["sharp"].precision > 0.97
+
+
+def test_a_fillet_without_points_is_none() -> None:
+    # Small cylinders stand on a plane here, and nothing is rounded.
+    part = random_block(48, "smooth")
+    scans, _ = simulate(part, StripeScanner(stripe_pitch=0.5, range_noise=0.025), seed=48)
+    result = segment(scans)
+    assert result.fillets is not None and len(result.fillets) == 0
+    assert not np.any(result.edge == EdgeClass.FILLET)
