@@ -138,6 +138,17 @@ class _Search:
         self._label = None
         self.own = self.labelling.choose(self.own, table, passes=passes, closed=free)
 
+    def scatter(self) -> float:
+        """Return how far samples are from the surfaces that they chose [mm], 0 without any."""
+        if len(self.surfaces) == 0 or self._label is None:
+            return 0.0
+        name = self.label[self.samples.index]
+        there = name >= 0
+        far, _ = evaluate_surfaces(
+            self.samples.point[there], name[there], self.surfaces.kind, self.surfaces.parameters
+        )
+        return float(np.sqrt(np.mean(far**2))) if len(far) else 0.0
+
     def open_seams(self) -> None:
         """Give the leaves of free forms that the surfaces beside them explain back to these.
 
@@ -160,7 +171,9 @@ class _Search:
         turn: float | None = None,
     ) -> bool:
         """Explain sets of samples; say whether that gave any new surface."""
-        tolerance = self.tolerance if turn is None else self.tolerance._replace(turn=turn)
+        tolerance = self.tolerance._replace(scatter=self.scatter())
+        if turn is not None:
+            tolerance = tolerance._replace(turn=turn)
         # A line has no normals, and is no surface.
         sets = [s for s in sets if 2 * np.count_nonzero(samples.normal[s].any(axis=1)) > len(s)]
         new, label = explain(samples, self.leaves, sets, tolerance, apart=apart)

@@ -54,6 +54,9 @@ _COVERED, _REAL = 0.6, 1.75
 # ... and, where positions are exact, when this share of them is nearer than so many noises: of
 # noise that is half, of what is cut out as far as it just fits a sixth.
 _EXACT, _MOSTLY = 0.5, 0.75
+# ... or, whatever lies beside them, when so many times the smallest number of points are no farther
+# from one than from other surfaces, but for the chance in so few, and its neighbours share nothing.
+_CLEAR, _ALIKE, _SHARED = 2.0, 1.15, 0.2
 
 
 class Tolerance(NamedTuple):
@@ -68,6 +71,8 @@ class Tolerance(NamedTuple):
     exact: bool = False
     """Positions are exact, next to their spacing: a surface that they lie on is real, whatever lies
     beside it."""
+    scatter: float = 0.0
+    """How far points are from the surfaces that were found so far [mm]; 0 = there are none."""
 
 
 def explain(
@@ -269,7 +274,7 @@ def _take_apart(
             going = [w for w in again if not w.ended(tolerance.points)]
             gained |= taken
         active = [w for w in gained if w.seeds > 0 and not w.ended(tolerance.points)]
-    return _real_ones(samples, sets, found, label, tolerance.noise, tolerance.exact)
+    return _real_ones(samples, sets, found, label, tolerance)
 
 
 def _real_ones(
@@ -277,10 +282,10 @@ def _real_ones(
     sets: list[np.ndarray],
     found: Surfaces,
     label: np.ndarray,
-    noise: float,
-    exact: bool,
+    tolerance: Tolerance,
 ) -> tuple[Surfaces, np.ndarray]:
     """Drop the surfaces of sets that are free forms."""
+    noise, most = tolerance.noise, len(found)
     real = np.zeros(len(found) + 1, bool)
     for members in sets:
         name, weight = label[members], samples.weight[members]
@@ -295,10 +300,18 @@ def _real_ones(
         product, square = far[1:][pair] * far[:-1][pair], far[1:][pair] ** 2
         shared = max(0.0, float(product.sum()) / max(float(square.sum()), 1e-300))
         real[name] = covered >= _COVERED and (1.0 + shared) * rms <= covered * _REAL * noise
-        if not exact:
-            continue
-        near = np.bincount(name, weight * (np.abs(far) <= _EXACT * noise), len(found))
-        real[:-1] |= near > _MOSTLY * np.maximum(np.bincount(name, weight, len(found)), 1e-300)
+        size = np.maximum(np.bincount(name, weight, most), 1e-300)
+        if tolerance.exact:
+            near = np.bincount(name, weight * (np.abs(far) <= _EXACT * noise), most)
+            real[:-1] |= near > _MOSTLY * size
+        alone = np.sqrt(np.bincount(name, weight * far**2, most) / size)
+        both = np.bincount(name[1:][pair], product, most)
+        both /= np.maximum(np.bincount(name[1:][pair], square, most), 1e-300)
+        real[:-1] |= (
+            (size >= _CLEAR * tolerance.points)
+            & (alone <= _ALIKE * tolerance.scatter)
+            & (both <= _SHARED)
+        )
     kept = np.flatnonzero(real[:-1])
     number = np.full(len(real), NONE, np.int32)
     number[kept] = np.arange(len(kept), dtype=np.int32)

@@ -116,17 +116,35 @@ def test_facets_that_curved_surfaces_cut_through_are_planes() -> None:
     assert planes >= 4
 
 
-@pytest.mark.parametrize(("high", "wave"), [(0.8, 1.0), (0.2, 2.5)])
-def test_a_wavy_sheet_is_no_sum_of_planes(high: float, wave: float) -> None:
-    place = np.random.default_rng(100).uniform(-6.0, 6.0, (2304, 2))
+def waves(place: np.ndarray, high: float, wave: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return height and slope of waves."""
     x, y = wave * place.T
-    height = high * np.sin(x) * np.cos(0.8 * y)
-    slope = (
-        high
-        * wave
-        * np.column_stack([np.cos(x) * np.cos(0.8 * y), -0.8 * np.sin(x) * np.sin(0.8 * y)])
-    )
-    _, leaves, samples = sheet(place, height, slope, NOISE, 0)
-    surfaces, label = explain(samples, leaves, [np.arange(len(samples))], TOLERANCE)
+    slope = np.column_stack([np.cos(x) * np.cos(0.8 * y), -0.8 * np.sin(x) * np.sin(0.8 * y)])
+    return high * np.sin(x) * np.cos(0.8 * y), high * wave * slope
+
+
+@pytest.mark.parametrize("scatter", [0.0, NOISE])
+@pytest.mark.parametrize(("high", "wave"), [(0.8, 1.0), (0.2, 2.5)])
+def test_a_wavy_sheet_is_no_sum_of_planes(high: float, wave: float, scatter: float) -> None:
+    place = np.random.default_rng(100).uniform(-6.0, 6.0, (2304, 2))
+    _, leaves, samples = sheet(place, *waves(place, high, wave), NOISE, 0)
+    tolerance = TOLERANCE._replace(scatter=scatter)
+    surfaces, label = explain(samples, leaves, [np.arange(len(samples))], tolerance)
     assert len(surfaces) == 0
     assert (label == -1).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_face_within_waves_is_one_where_it_is_known_what_points_leave(seed: int) -> None:
+    place = np.random.default_rng(seed).uniform(-6.0, 6.0, (2304, 2))
+    height, slope = waves(place, 0.8, 2.0)
+    flat = np.abs(place[:, 0]) < 1.0
+    height, slope = np.where(flat, 0.0, height), np.where(flat[:, None], 0.0, slope)
+    grid, leaves, samples = sheet(place, height, slope, NOISE, seed)
+    flat = flat[runtime.download(grid.order)[samples.index]]
+    every = [np.arange(len(samples))]
+    assert len(explain(samples, leaves, every, TOLERANCE)[0]) == 0
+    surfaces, label = explain(samples, leaves, every, TOLERANCE._replace(scatter=NOISE))
+    assert surfaces.kind.tolist() == [SurfaceKind.PLANE]
+    assert np.mean(label[flat] == 0) > 0.8
+    assert np.mean(label[~flat] == 0) < 0.05
