@@ -43,24 +43,26 @@ def fit_quadrics(point: np.ndarray, normal: np.ndarray, start: np.ndarray) -> Qu
             empty.
     """
     first, count = start[:-1], np.diff(start)
-    owner = np.repeat(np.arange(len(count)), count)
+
+    def each(value: np.ndarray) -> np.ndarray:
+        return np.repeat(value, count, axis=-1)
 
     def mean(value: np.ndarray) -> np.ndarray:
         return np.add.reduceat(value, first) / count
 
     centre = np.stack([mean(np.ascontiguousarray(column)) for column in point.T], axis=1)
-    q = np.ascontiguousarray((point - centre[owner]).T)
+    q = point.T - each(centre.T)
     spread = np.empty((len(count), 3, 3))
     for i in range(3):
         for j in range(i + 1):
             spread[:, i, j] = spread[:, j, i] = mean(q[i] * q[j])
     extent = np.sqrt(np.maximum(np.trace(spread, axis1=1, axis2=2), 1e-300))
     value, axes = np.linalg.eigh(spread / extent[:, None, None] ** 2)
-    frame = axes.transpose(1, 2, 0)[:, :, owner]  # by coordinate and axis
-    w, u, v = np.einsum("is,iks->ks", q / extent[owner], frame)
+    frame = each(axes.transpose(1, 2, 0))  # by coordinate and axis
+    w, u, v = np.einsum("is,iks->ks", q / each(extent), frame)
     nw, nu, nv = np.einsum("is,iks->ks", normal.T, frame)
     height = _heights(w, (np.ones(len(u)), u, v, u * u, u * v, v * v), mean)
-    a, b, c, d, e, f = height.T[:, owner]
+    a, b, c, d, e, f = each(height.T)
     square = mean((w - a - b * u - c * v - d * u * u - e * u * v - f * v * v) ** 2)
     slope_u, slope_v = b + 2.0 * d * u + e * v, c + e * u + 2.0 * f * v
     cosine = (nw - slope_u * nu - slope_v * nv) ** 2 / (1.0 + slope_u**2 + slope_v**2)

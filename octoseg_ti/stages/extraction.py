@@ -305,8 +305,8 @@ def _real_ones(
             near = np.bincount(name, weight * (np.abs(far) <= _EXACT * noise), most)
             real[:-1] |= near > _MOSTLY * size
         alone = np.sqrt(np.bincount(name, weight * far**2, most) / size)
-        both = np.bincount(name[1:][pair], product, most)
-        both /= np.maximum(np.bincount(name[1:][pair], square, most), 1e-300)
+        whole = np.maximum(np.bincount(name[1:][pair], square, most), 1e-300)
+        both = np.bincount(name[1:][pair], product, most) / whole
         real[:-1] |= (
             (size >= _CLEAR * tolerance.points)
             & (alone <= _ALIKE * tolerance.scatter)

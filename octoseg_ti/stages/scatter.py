@@ -36,6 +36,8 @@ _EDGE = 8.0
 _APART, _MEETINGS = 0.75, 16
 # Chance alone tells them apart by less than this share of the scatter.
 _CHANCE = 0.3
+# Odd numbers with well mixed bits (the first digits of the roots of 2, 3 and 5, times 2^64).
+_MIX = np.array([0x6A09E667F3BCC909, 0xBB67AE8584CAA73B, 0x3C6EF372FE94F82B], np.uint64)
 
 
 def surface_noise(
@@ -75,8 +77,7 @@ def surface_noise(
     begin = np.cumsum(count) - count
     index = np.concatenate(list(found.values()))
     point = runtime.download(grid.point)[index]
-    # In an order that has nothing to do with that of the input.
-    order = np.lexsort((*point.T, np.repeat(np.arange(len(count)), count)))
+    order = _shuffled(point, np.repeat(np.arange(len(count)), count))
     point, normal = point[order], runtime.download(grid.normal)[index[order]]
     rms, bent = _residuals(point, normal, np.append(begin, len(index)))
     seen = view[runtime.download(grid.order)[index[order]]]
@@ -87,6 +88,17 @@ def surface_noise(
     if apart <= _CHANCE * within:
         return _typical(rms), 0.0
     return max(_typical(rms), float(np.hypot(within, apart))), apart
+
+
+def _shuffled(point: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Return the points group by group, in an order that only their coordinates tell.
+
+    So no sum over them depends on the order of the input. Groups have numbers below 1024.
+    """
+    bits = np.ascontiguousarray(point).view(np.uint64)
+    mixed = bits[:, 0] * _MIX[0] + bits[:, 1] * _MIX[1] + bits[:, 2] * _MIX[2]
+    mixed = (mixed ^ (mixed >> np.uint64(32))) * _MIX[0]
+    return np.argsort((group.astype(np.uint64) << np.uint64(54)) | (mixed >> np.uint64(10)))
 
 
 def _typical(rms: np.ndarray) -> float:
@@ -113,8 +125,9 @@ def _by_view(
     """
     if len(view) == 0 or np.all(view == view[0]):
         return 0.0, 0.0
-    order = np.lexsort((view, group))
-    piece = np.cumsum(np.diff(group[order] * (view.max() + 1) + view[order], prepend=-1) > 0) - 1
+    key = group * (view.max() + 1) + view
+    order = np.argsort(key, kind="stable")
+    piece = np.cumsum(np.diff(key[order], prepend=-1) > 0) - 1
     count = np.bincount(piece)
     name = group[order][np.cumsum(count) - count]
     large = count >= _FEWEST
