@@ -26,21 +26,19 @@ from octoseg_ti.stages.labelling import (
     own_lists,
     surface_table,
 )
-from octoseg_ti.stages.leaves import (
-    Leaves,
-    Samples,
-    joined_samples,
-    members_of,
-    sample_leaves,
-)
-from octoseg_ti.stages.merging import (
-    cut_out,
-    explained_by_others,
-    merge_surfaces,
-    smooth_contacts,
-)
+from octoseg_ti.stages.leaves import Leaves, Samples, joined_samples, members_of, sample_leaves
+from octoseg_ti.stages.merging import cut_out, explained_by_others, merge_surfaces, smooth_contacts
 from octoseg_ti.stages.rounds import hidden_rounds, refitted_rounds
-from octoseg_ti.stages.sets import Surfaces, fit_sets, flat_sets, lie_on, no_surfaces, spread
+from octoseg_ti.stages.sets import (
+    Surfaces,
+    fit_sets,
+    flat_sets,
+    lie_on,
+    no_surfaces,
+    rms_of,
+    sets_of,
+    spread,
+)
 from octoseg_ti.stages.settling import DOUBT, settle
 from octoseg_ti.types import NONE, SurfaceKind
 
@@ -138,17 +136,6 @@ class _Search:
         self._label = None
         self.own = self.labelling.choose(self.own, table, passes=passes, closed=free)
 
-    def scatter(self) -> float:
-        """Return how far samples are from the surfaces that they chose [mm], 0 without any."""
-        if len(self.surfaces) == 0 or self._label is None:
-            return 0.0
-        name = self.label[self.samples.index]
-        there = name >= 0
-        far, _ = evaluate_surfaces(
-            self.samples.point[there], name[there], self.surfaces.kind, self.surfaces.parameters
-        )
-        return float(np.sqrt(np.mean(far**2))) if len(far) else 0.0
-
     def open_seams(self) -> None:
         """Give the leaves of free forms that the surfaces beside them explain back to these.
 
@@ -171,7 +158,10 @@ class _Search:
         turn: float | None = None,
     ) -> bool:
         """Explain sets of samples; say whether that gave any new surface."""
-        tolerance = self.tolerance._replace(scatter=self.scatter())
+        scatter = 0.0
+        if self._label is not None:
+            scatter = rms_of(self.samples, self._label[self.samples.index], self.surfaces)
+        tolerance = self.tolerance._replace(scatter=scatter)
         if turn is not None:
             tolerance = tolerance._replace(turn=turn)
         # A line has no normals, and is no surface.
@@ -413,10 +403,10 @@ def find_surfaces(
     """
     search = _Search(grid, leaves, tolerance, rule, limit)
     samples = search.samples
-    search.add(samples, _sets_of(samples, leaves, group, tolerance.points))
+    search.add(samples, sets_of(samples, leaves, group, tolerance.points))
     if search.free.any():
         inside = np.where(search.free, cut, NONE)
-        faces = _sets_of(samples, leaves, inside, tolerance.points)
+        faces = sets_of(samples, leaves, inside, tolerance.points)
         search.add(samples, faces, apart=False)
     search.early = len(search.surfaces)
     for _ in range(_ROUNDS):
@@ -453,11 +443,3 @@ def find_surfaces(
         own=label_lists(leaves, search.label),
         off=search.off_next(),
     )
-
-
-def _sets_of(samples: Samples, leaves: Leaves, group: np.ndarray, least: float) -> list[np.ndarray]:
-    """Return the samples of every group that has enough points."""
-    part = group[samples.leaf]
-    there = group >= 0
-    size = np.bincount(group[there], leaves.count[there], minlength=1)
-    return [s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= least]

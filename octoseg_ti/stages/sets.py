@@ -11,7 +11,7 @@ from octoseg_ti.device.surfaces import KINDS, evaluate_surfaces, surface_in_row
 from octoseg_ti.fitting.primitives import fit_all
 from octoseg_ti.fitting.quadrics import fit_quadrics
 from octoseg_ti.fitting.selection import choose, plane_does
-from octoseg_ti.stages.leaves import Samples
+from octoseg_ti.stages.leaves import Leaves, Samples, members_of
 from octoseg_ti.types import SurfaceKind
 
 # A surface fits when its residual is below this many noises.
@@ -156,6 +156,36 @@ def spread(members: np.ndarray, most: int) -> np.ndarray:
     if len(members) <= most:
         return members
     return members[(2 * np.arange(most) + 1) * len(members) // (2 * most)]
+
+
+def sets_of(samples: Samples, leaves: Leaves, group: np.ndarray, least: float) -> list[np.ndarray]:
+    """Return the samples of every group of leaves that has enough points.
+
+    Args:
+        samples: The samples.
+        leaves: The leaves.
+        group: Group of every leaf, -1 = none, shape (C,), i32.
+        least: Fewest points.
+    """
+    part = group[samples.leaf]
+    there = group >= 0
+    size = np.bincount(group[there], leaves.count[there], minlength=1)
+    return [s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= least]
+
+
+def rms_of(samples: Samples, label: np.ndarray, surfaces: Surfaces) -> float:
+    """Return how far samples are from the surfaces that they lie on [mm]; 0 where none does.
+
+    Args:
+        samples: The samples.
+        label: Surface of every sample, -1 = none, shape (A,), i32.
+        surfaces: The surfaces.
+    """
+    there = label >= 0
+    far, _ = evaluate_surfaces(
+        samples.point[there], label[there], surfaces.kind, surfaces.parameters
+    )
+    return float(np.sqrt(np.mean(far**2))) if len(far) else 0.0
 
 
 def capped_rms(
