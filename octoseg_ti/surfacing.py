@@ -13,8 +13,8 @@ from octoseg_ti.patches import Regions, relabelled
 from octoseg_ti.stages.extraction import Tolerance
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import Labelling, Rule, common_label, label_lists, surface_table
-from octoseg_ti.stages.leaves import Leaves, leaf_graph, without_gaps
-from octoseg_ti.stages.merging import mean_squares, pieces
+from octoseg_ti.stages.leaves import Leaves, leaf_graph
+from octoseg_ti.stages.merging import boxes, mean_squares, pieces
 from octoseg_ti.stages.settling import settle
 from octoseg_ti.surface_search import AROUND, EXPLAINED, FREE, NARROW, Surfaced, find_surfaces
 from octoseg_ti.types import NONE
@@ -53,8 +53,8 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         limit=params.edges.fillet_radius,
     )  # fmt: skip
     gap = params.normals.gap
-    near = graph if gap is None else without_gaps(graph, PIECE_GAPS * gap)
-    label, surface = number_pieces(near, surfaced, least, fewest)
+    piece = connected(runtime.download(grid.point), graph, surfaced, gap)
+    label, surface = number_pieces(graph, surfaced, piece, least, fewest)
     label, surface, free = _with_free_forms(label, surface, found, least)
     if len(surface):
         table = surface_table(
@@ -140,21 +140,37 @@ def _with_free_forms(
     return np.where(label < 0, number[found.label], label), surface, len(stay)
 
 
+def connected(points: np.ndarray, leaves: Leaves, found: Surfaced, gap: float | None) -> np.ndarray:
+    """Return the connected pieces of the surfaces, as `pieces` does.
+
+    Args:
+        points: Sorted positions [mm], shape (n, 3), f64.
+        leaves: The leaves.
+        found: The surfaces and their points.
+        gap: The longest edge of a triangle [mm]; pieces are no farther apart than a few of these.
+            None = not known.
+    """
+    if gap is None:
+        return pieces(leaves, found.own)
+    box = boxes(points, leaves, found.own, found.label)
+    return pieces(leaves, found.own, box, PIECE_GAPS * gap)
+
+
 def number_pieces(
-    leaves: Leaves, found: Surfaced, least: float, fewest: float
+    leaves: Leaves, found: Surfaced, piece: np.ndarray, least: float, fewest: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Number the connected pieces of the surfaces by size.
 
     Args:
         leaves: The leaves.
         found: The surfaces and their points.
+        piece: Piece of every entry of their lists (`pieces`), shape (C, most), i32.
         least: A piece with fewer points is no patch, nor is one that other surfaces explain,
         fewest: unless it is the largest of its surface and has so many.
 
     Returns:
         Patch of every sorted point, -1 = none, shape (n,), i32; and the surface of every patch.
     """
-    piece = pieces(leaves, found.own, len(found.surfaces))
     mine = np.repeat(piece[:, 0], leaves.count)
     # Where a leaf holds nothing but its first surface, all of its points are of that piece.
     mixed = (found.own[:, 1] >= 0) | (common_label(leaves, found.label) < 0)

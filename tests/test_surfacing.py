@@ -11,6 +11,7 @@ from reference.leaves import leaves_of
 from octoseg_ti import Scans, SurfaceKind, segment
 from octoseg_ti.stages.labelling import label_lists
 from octoseg_ti.stages.leaves import Leaves
+from octoseg_ti.stages.merging import pieces
 from octoseg_ti.stages.sets import Surfaces
 from octoseg_ti.surface_search import EXPLAINED, FREE, Surfaced
 from octoseg_ti.surfacing import _with_free_forms, number_pieces
@@ -34,6 +35,12 @@ def band(ends: list[float], names: list[int]) -> tuple[Leaves, np.ndarray, np.nd
     leaves, order, _ = leaves_of(np.column_stack([x, y, 0.0 * x]), 1.0)
     x = x[order]
     return leaves, np.array(names)[np.searchsorted(ends, x)], x
+
+
+def numbered(
+    leaves: Leaves, found: Surfaced, least: float, fewest: float
+) -> tuple[np.ndarray, np.ndarray]:
+    return number_pieces(leaves, found, pieces(leaves, found.own), least, fewest)
 
 
 def plain_numbers(
@@ -78,11 +85,11 @@ def test_numbers_of_pieces_equal_the_reference(seed: int) -> None:
     label = np.where(rng.random(900) < 0.03, rng.integers(-1, count, 900), label)
     calm = rng.random(len(leaves)) < 0.5
     found = surfaced(leaves, label, rng.uniform(0, np.where(calm[leaf], 2.2, 6.0)), count)
-    numbers, surface = number_pieces(leaves, found, 5, 3)
+    numbers, surface = numbered(leaves, found, 5, 3)
     expected, names = plain_numbers(leaves, found, 5, 3)
     np.testing.assert_array_equal(numbers, expected, err_msg=f"seed {seed}")
     assert surface.tolist() == names
-    strict, _ = number_pieces(leaves, surfaced(leaves, label, 0 * label + 9.0, count), 5, 3)
+    strict, _ = numbered(leaves, surfaced(leaves, label, 0 * label + 9.0, count), 5, 3)
     assert np.any((strict >= 0) & (numbers < 0))
 
 
@@ -91,7 +98,7 @@ def test_a_second_piece_that_another_surface_explains_is_no_patch(off: float, pa
     leaves, label, x = band([8.0, 14.0, 15.0, 20.0], [0, 1, 0, 2])
     small = (x > 14.0) & (x < 15.0)
     found = surfaced(leaves, label, np.where(small, off, 9.0), 3)
-    numbers, surface = number_pieces(leaves, found, 20, 10)
+    numbers, surface = numbered(leaves, found, 20, 10)
     assert surface.tolist() == ([0, 1, 2, 0] if patch else [0, 1, 2])
     np.testing.assert_array_equal(numbers, np.where(small, 3 if patch else -1, label))
 
@@ -101,11 +108,11 @@ def test_the_largest_piece_of_a_surface_stays_and_may_be_small() -> None:
     small = (x > 14.0) & (x < 15.0)
     found = surfaced(leaves, label, np.where(small, 0.0, 9.0), 3)
     for least, fewest, kept in ((20, 10, True), (100, 64, True), (100, 65, False)):
-        numbers, surface = number_pieces(leaves, found, least, fewest)
+        numbers, surface = numbered(leaves, found, least, fewest)
         # The second piece of surface 1 has 320 points, the first has 384.
         assert surface.tolist() == ([0, 1, 1, 2] if kept else [0, 1, 1])
         assert (numbers[small] == (3 if kept else -1)).all()
-    _, surface = number_pieces(leaves, found, 321, 10)
+    _, surface = numbered(leaves, found, 321, 10)
     assert surface.tolist() == [0, 1, 2]
 
 

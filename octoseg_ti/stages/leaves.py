@@ -6,7 +6,7 @@ The points of a leaf are picked by a hash of their coordinates: which ones does 
 order in which they were scanned.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -170,28 +170,6 @@ def leaf_boxes(points: np.ndarray, first: np.ndarray) -> np.ndarray:
     low = np.minimum.reduceat(points, first, axis=0)
     high = np.maximum.reduceat(points, first, axis=0)
     return np.concatenate([low, high], axis=1)
-
-
-def without_gaps(leaves: Leaves, gap: float) -> Leaves:
-    """Return the leaves without the pairs whose points are far apart, though the boxes touch.
-
-    Args:
-        leaves: The leaves.
-        gap: Largest distance of the boxes around the points of two leaves [mm].
-    """
-    wide = np.flatnonzero(leaves.size[leaves.a] + leaves.size[leaves.b] > gap)
-    if len(wide) == 0:
-        return leaves
-    low, high = leaves.box[:, :3], leaves.box[:, 3:]
-    a, b = leaves.a[wide], leaves.b[wide]
-    apart = np.maximum(np.maximum(low[a] - high[b], low[b] - high[a]), 0.0)
-    kept = np.ones(len(leaves.a), bool)
-    kept[wide] = np.einsum("ij,ij->i", apart, apart) <= gap**2
-    if kept.all():
-        return leaves
-    a, b = leaves.a[kept], leaves.b[kept]
-    start, neighbor = _linked(len(leaves), a, b)
-    return replace(leaves, a=a, b=b, start=start, neighbor=neighbor)
 
 
 def sample_leaves(

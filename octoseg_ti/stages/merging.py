@@ -4,6 +4,7 @@ import numpy as np
 
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
+from octoseg_ti.stages.labelling import common_label
 from octoseg_ti.stages.leaves import Leaves, Samples, distinct, members_of
 from octoseg_ti.stages.sets import Surfaces, capped_rms, fit_sets, spread
 from octoseg_ti.types import NONE
@@ -275,13 +276,17 @@ def mean_squares(
     return means
 
 
-def pieces(leaves: Leaves, own: np.ndarray, count: int) -> np.ndarray:
+def pieces(
+    leaves: Leaves, own: np.ndarray, box: np.ndarray | None = None, gap: float = np.inf
+) -> np.ndarray:
     """Return the connected pieces of the surfaces.
 
     Args:
         leaves: The leaves.
         own: Surfaces with points in every leaf, ascending, then -1; shape (C, most), i32.
-        count: Number of surfaces M.
+        box: Lower and upper corner of the points of every entry that is one, row by row (`boxes`)
+            [mm], shape (k, 6); None = these do not count.
+        gap: Largest distance of the boxes of two entries of one piece [mm].
 
     Returns:
         Piece of every entry of ``own``, shape (C, most), i32, -1 where that holds no surface. A
@@ -305,9 +310,49 @@ def pieces(leaves: Leaves, own: np.ndarray, count: int) -> np.ndarray:
         hit = same.any(axis=1)
         ends_a.append(table[a[hit], k])
         ends_b.append(table[b[hit], same[hit].argmax(axis=1)])
-    root = components(
-        len(entry), np.concatenate(ends_a).astype(np.int32), np.concatenate(ends_b).astype(np.int32)
-    )
+    one, other = np.concatenate(ends_a).astype(np.int32), np.concatenate(ends_b).astype(np.int32)
+    if box is not None:
+        # Leaves may touch whose points are far apart; and a large leaf that holds a few points of
+        # a surface reaches farther than these.
+        apart = np.maximum(box[one, :3] - box[other, 3:], box[other, :3] - box[one, 3:])
+        apart = np.maximum(apart, 0.0)
+        near = np.einsum("ij,ij->i", apart, apart) <= gap**2
+        one, other = one[near], other[near]
+    root = components(len(entry), one, other)
     piece = np.full(own.size, NONE, np.int32)
     piece[entry] = root
     return piece.reshape(own.shape)
+
+
+def boxes(points: np.ndarray, leaves: Leaves, own: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """Return the box around the points of every surface in every leaf [mm], shape (k, 6).
+
+    Args:
+        points: Sorted positions [mm], shape (n, 3), f64.
+        leaves: The leaves.
+        own: Surfaces with points in every leaf, ascending, then -1; shape (C, most), i32.
+        label: Surface of every sorted point, -1 = none, shape (n,), i32.
+
+    Returns:
+        Lower and upper corner for every entry of ``own`` that is one, row by row.
+    """
+    cell, rank = np.nonzero(own >= 0)
+    width = np.int64(own.max(initial=0)) + 1
+    key = cell * width + own[cell, rank]
+    box = leaves.box[cell].copy()
+    several = np.flatnonzero((own[:, 1] >= 0) | (common_label(leaves, label) < 0))
+    count = leaves.count[several]
+    ends = np.cumsum(count)
+    mine = np.arange(ends[-1] if len(ends) else 0)
+    mine = mine + np.repeat(leaves.first[several] - (ends - count), count)
+    name = np.repeat(several, count) * width + label[mine]
+    mine, name = mine[label[mine] >= 0], name[label[mine] >= 0]
+    order = np.argsort(name, kind="stable")
+    mine, name = mine[order], name[order]
+    first = np.flatnonzero(np.diff(name, prepend=-1))
+    at = np.minimum(np.searchsorted(key, name[first]), max(len(key) - 1, 0))
+    held = key[at] == name[first]  # the lists have an end
+    low = np.minimum.reduceat(points[mine], first, axis=0) if len(first) else np.zeros((0, 3))
+    high = np.maximum.reduceat(points[mine], first, axis=0) if len(first) else np.zeros((0, 3))
+    box[at[held]] = np.concatenate([low, high], axis=1)[held]
+    return box

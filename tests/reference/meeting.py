@@ -21,11 +21,32 @@ def contacts(own: list[list[int]], pairs: list[tuple[int, int]]) -> dict[tuple[i
     return found
 
 
-def pieces(own: list[list[int]], pairs: list[tuple[int, int]]) -> list[list[int]]:
-    """Return the piece of every entry, by the number of its first entry."""
+def pieces(
+    own: list[list[int]],
+    pairs: list[tuple[int, int]],
+    points: dict[tuple[int, int], np.ndarray] | None = None,
+    gap: float = np.inf,
+) -> list[list[int]]:
+    """Return the piece of every entry, by the number of its first entry.
+
+    With the points of every entry, boxes around them are no farther apart than a gap.
+    """
+
+    def near(a: int, b: int, s: int) -> bool:
+        if points is None:
+            return True
+        one, other = points[a, s], points[b, s]
+        apart = np.maximum(one.min(axis=0) - other.max(axis=0), other.min(axis=0) - one.max(axis=0))
+        return float(np.linalg.norm(np.maximum(apart, 0.0))) <= gap
+
     number = {(c, s): 0 for c, mine in enumerate(own) for s in mine}
     number = {entry: k for k, entry in enumerate(number)}
-    edges = [(number[a, s], number[b, s]) for a, b in pairs for s in own[a] if s in own[b]]
+    edges = [
+        (number[a, s], number[b, s])
+        for a, b in pairs
+        for s in own[a]
+        if s in own[b] and near(a, b, s)
+    ]
     root = components(list(range(len(number))), edges)
     return [[root[number[c, s]] for s in mine] for c, mine in enumerate(own)]
 

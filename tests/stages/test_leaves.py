@@ -11,7 +11,7 @@ from reference.labelling import pick
 
 from octoseg_ti.device import runtime
 from octoseg_ti.stages.grid import build_grid
-from octoseg_ti.stages.leaves import joined_samples, sample_leaves, without_gaps
+from octoseg_ti.stages.leaves import joined_samples, sample_leaves
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -32,24 +32,12 @@ def test_the_graph_is_that_of_touching_boxes(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("gap", [0.02, 0.2, 1e3])
-def test_pairs_over_a_gap_are_left_out(seed: int, gap: float) -> None:
+def test_boxes_hold_the_points_of_leaves(seed: int) -> None:
     grid, leaves = surface_leaves(seed)
     point = runtime.download(grid.point)
-    boxes = [point[f : f + n] for f, n in zip(leaves.first, leaves.count, strict=True)]
-
-    def near(a: int, b: int) -> bool:
-        apart = np.maximum(
-            boxes[a].min(axis=0) - boxes[b].max(axis=0), boxes[b].min(axis=0) - boxes[a].max(axis=0)
-        )
-        return float(np.linalg.norm(np.maximum(apart, 0.0))) <= gap
-
-    expected = [(int(a), int(b)) for a, b in zip(leaves.a, leaves.b, strict=True) if near(a, b)]
-    linked = without_gaps(leaves, gap)
-    assert list(zip(linked.a.tolist(), linked.b.tolist(), strict=True)) == expected
-    assert (len(expected) == len(leaves.a)) == (linked is leaves)
-    degree = np.diff(linked.start)
-    assert degree.sum() == len(linked.neighbor) == 2 * len(expected)
+    for f, n, box in zip(leaves.first, leaves.count, leaves.box, strict=True):
+        np.testing.assert_array_equal(box[:3], point[f : f + n].min(axis=0))
+        np.testing.assert_array_equal(box[3:], point[f : f + n].max(axis=0))
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 from reference import meeting
 from reference.device_grid import samples_of, surface_leaves
+from reference.leaves import leaves_of
 from reference.surfaces import CYLINDER, PLANE, patch_of
 
-from octoseg_ti.stages.labelling import own_lists
+from octoseg_ti.device import runtime
+from octoseg_ti.stages.labelling import label_lists, own_lists
 from octoseg_ti.stages.leaves import Leaves, members_of, sample_leaves
 from octoseg_ti.stages.merging import (
+    boxes,
     contacts,
     cut_out,
     explained_by_others,
@@ -52,7 +55,43 @@ def test_contacts_equal_the_reference(seed: int, count: int) -> None:
 def test_pieces_equal_the_reference(seed: int, count: int) -> None:
     _, leaves = surface_leaves(seed, 900)
     own = random_own(leaves, seed, count)
-    assert as_lists(pieces(leaves, own, count)) == meeting.pieces(as_lists(own), pairs_of(leaves))
+    assert as_lists(pieces(leaves, own)) == meeting.pieces(as_lists(own), pairs_of(leaves))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("gap", [0.02, 0.3, 1e3])
+def test_points_of_one_piece_are_no_farther_apart_than_the_gap(seed: int, gap: float) -> None:
+    grid, leaves = surface_leaves(seed, 900)
+    point = runtime.download(grid.point)
+    rng = np.random.default_rng(seed)
+    leaf = np.repeat(np.arange(len(leaves)), leaves.count)
+    label = rng.integers(-1, 2, len(leaves))[leaf]
+    label = np.where(rng.random(900) < 0.2, rng.integers(-1, 3, 900), label).astype(np.int32)
+    own = label_lists(leaves, label)
+    box = boxes(point, leaves, own, label)
+    points = {
+        (c, s): point[(leaf == c) & (label == s)] for c, m in enumerate(as_lists(own)) for s in m
+    }
+    expected = np.array([[*p.min(axis=0), *p.max(axis=0)] for p in points.values()])
+    assert np.all(box[:, :3] <= expected[:, :3]) and np.all(box[:, 3:] >= expected[:, 3:])
+    several = np.array([np.ptp(label[leaf == c]) > 0 for c, _ in points])
+    np.testing.assert_array_equal(box[several], expected[several])
+    found = as_lists(pieces(leaves, own, box, gap))
+    assert found == meeting.pieces(as_lists(own), pairs_of(leaves), points, gap)
+
+
+def test_a_large_leaf_with_a_stray_point_links_nothing() -> None:
+    # Two faces of one plane, three apart, and between them one leaf of something else.
+    x, y = (a.ravel() for a in np.mgrid[0.05:9.0:0.1, 0.05:3.0:0.1])
+    leaves, order, _ = leaves_of(np.column_stack([x, y, 0.0 * x]), 3.0)
+    points = np.column_stack([x, y, 0.0 * x])[order]
+    label = np.where((points[:, 0] < 3.0) | (points[:, 0] > 6.0), 0, 1).astype(np.int32)
+    label[np.flatnonzero(label == 1)[np.argmin(points[label == 1, 0])]] = 0
+    own = label_lists(leaves, label)
+    assert [row[row >= 0].tolist() for row in own] == [[0], [0, 1], [0]]
+    assert len(np.unique(pieces(leaves, own)[own == 0])) == 1
+    near = pieces(leaves, own, boxes(points, leaves, own, label), 1.0)
+    assert len(np.unique(near[own == 0])) == 2
 
 
 def test_surfaces_that_meet_at_an_edge_are_no_smooth_contact() -> None:
