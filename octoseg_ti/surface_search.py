@@ -159,8 +159,8 @@ class _Search:
     ) -> bool:
         """Explain sets of samples; say whether that gave any new surface."""
         scatter = 0.0
-        if self._label is not None:
-            scatter = rms_of(self.samples, self._label[self.samples.index], self.surfaces)
+        if apart and len(self.surfaces):
+            scatter = rms_of(self.samples, self.label[self.samples.index], self.surfaces)
         tolerance = self.tolerance._replace(scatter=scatter)
         if turn is not None:
             tolerance = tolerance._replace(turn=turn)
@@ -238,14 +238,14 @@ class _Search:
         kind, parameters = self.surfaces.kind.copy(), self.surfaces.parameters.copy()
         # Some points of the next surface can bend a plane.
         many = np.array([len(s) >= _FEWEST for s in sets], bool)
-        many[count - len(self.sides) :] = False
+        base = count - len(self.sides)
+        many[base:] = False
         curved = np.flatnonzero((kind != SurfaceKind.PLANE) & many)
         flat, planes = flat_sets(both, [sets[k] for k in curved], noise)
         kind[curved[flat]], parameters[curved[flat]] = SurfaceKind.PLANE, planes[flat]
         point = both.point[np.concatenate([np.zeros(0, np.int64), *sets])]
         start = np.cumsum([0] + [len(s) for s in sets])
         refined = refine(point, start, kind, parameters, noise=noise)
-        base = count - len(self.sides)
         refined[base:] = parameters[base:]
         # So few degrees tell no radius alone: the planes beside a round do.
         parameters = refitted_rounds(

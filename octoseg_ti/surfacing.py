@@ -14,7 +14,7 @@ from octoseg_ti.stages.extraction import Tolerance
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import Labelling, Rule, common_label, label_lists, surface_table
 from octoseg_ti.stages.leaves import Leaves, leaf_graph
-from octoseg_ti.stages.merging import boxes, mean_squares, pieces
+from octoseg_ti.stages.merging import entry_boxes, mean_squares, pieces
 from octoseg_ti.stages.settling import settle
 from octoseg_ti.surface_search import AROUND, EXPLAINED, FREE, NARROW, Surfaced, find_surfaces
 from octoseg_ti.types import NONE
@@ -53,7 +53,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         limit=params.edges.fillet_radius,
     )  # fmt: skip
     gap = params.normals.gap
-    piece = connected(runtime.download(grid.point), graph, surfaced, gap)
+    piece = connected_pieces(runtime.download(grid.point), graph, surfaced, gap)
     label, surface = number_pieces(graph, surfaced, piece, least, fewest)
     label, surface, free = _with_free_forms(label, surface, found, least)
     if len(surface):
@@ -140,7 +140,9 @@ def _with_free_forms(
     return np.where(label < 0, number[found.label], label), surface, len(stay)
 
 
-def connected(points: np.ndarray, leaves: Leaves, found: Surfaced, gap: float | None) -> np.ndarray:
+def connected_pieces(
+    points: np.ndarray, leaves: Leaves, found: Surfaced, gap: float | None
+) -> np.ndarray:
     """Return the connected pieces of the surfaces, as `pieces` does.
 
     Args:
@@ -152,7 +154,7 @@ def connected(points: np.ndarray, leaves: Leaves, found: Surfaced, gap: float | 
     """
     if gap is None:
         return pieces(leaves, found.own)
-    box = boxes(points, leaves, found.own, found.label)
+    box = entry_boxes(points, leaves, found.own, found.label)
     return pieces(leaves, found.own, box, PIECE_GAPS * gap)
 
 

@@ -32,7 +32,7 @@ def surfaced(leaves: Leaves, label: np.ndarray, off: np.ndarray, count: int) -> 
 def band(ends: list[float], names: list[int]) -> tuple[Leaves, np.ndarray, np.ndarray]:
     """Return a strip of points, cut across into surfaces: its leaves, labels and places along."""
     x, y = (a.ravel() for a in np.mgrid[0.125:20.0:0.25, 0.125:4.0:0.25])
-    leaves, order, _ = leaves_of(np.column_stack([x, y, 0.0 * x]), 1.0)
+    leaves, order = leaves_of(np.column_stack([x, y, 0.0 * x]), 1.0)
     x = x[order]
     return leaves, np.array(names)[np.searchsorted(ends, x)], x
 

@@ -82,7 +82,7 @@ def mark_blends(
         kept = (search.label[point] != patch) & (edge[point] != int(EdgeClass.FILLET))
         point, patch = point[kept], patch[kept]
         far = nearest_marked(
-            search.device[0], mark, search.leaves, search.box, point, search.leaf_of(point), patch,
+            search.device[0], mark, search.leaves, point, search.leaf_of(point), patch,
             np.full(len(point), EDGE * search.spacing),
         )  # fmt: skip
         edge[point[np.isfinite(far)]] = int(EdgeClass.FILLET)

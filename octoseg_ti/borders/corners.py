@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from octoseg_ti.borders.fillets import EVEN, FEWEST, FOREIGN, ON, WORSE, Fit
-from octoseg_ti.borders.zones import EDGE, TURN, Search, Zones, listed, ranges
+from octoseg_ti.borders.zones import EDGE, TURN, Search, Zones, listed
 from octoseg_ti.device.surfaces import evaluate_surfaces
+from octoseg_ti.stages.leaves import ranges
 from octoseg_ti.stages.profiles import BALL
 from octoseg_ti.stages.sets import spread
 from octoseg_ti.types import EdgeClass
@@ -145,8 +146,8 @@ class _Around:
     def __init__(self, search: Search) -> None:
         """Sort the boxes of the leaves along one axis."""
         self.leaves = search.leaves
-        self.order = np.argsort(search.box[:, 0], kind="stable")
-        self.box = search.box[self.order]
+        self.order = np.argsort(search.leaves.box[:, 0], kind="stable")
+        self.box = search.leaves.box[self.order]
         self.wide = float((self.box[:, 3] - self.box[:, 0]).max(initial=0.0))
 
     def points(self, place: np.ndarray, reach: float) -> np.ndarray:

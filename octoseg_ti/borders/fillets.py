@@ -286,9 +286,7 @@ def without_support(
     strong[weak] = NONE
     leaf = search.leaf_of(weak)
     reach = np.sqrt(2.0 * ON * search.noise * radius) + search.spacing
-    far = nearest_marked(
-        search.device[0], strong, search.leaves, search.box, weak, leaf, mark[weak], reach
-    )
+    far = nearest_marked(search.device[0], strong, search.leaves, weak, leaf, mark[weak], reach)
     return weak[~np.isfinite(far)]
 
 
@@ -332,11 +330,15 @@ def strips_of(search: Search, number: np.ndarray) -> np.ndarray:
 
 def strip_pairs(search: Search, zones: Zones, chosen: np.ndarray) -> np.ndarray:
     """Return the sides of the fillet that every patch is a strip of, -1 = none, shape (K, 2)."""
-    fillets = np.flatnonzero(chosen)
+    sides = np.append(zones.pairs[chosen], [[NONE, NONE]], axis=0)
+    return sides[strips_of(search, numbers_of(chosen))]
+
+
+def numbers_of(chosen: np.ndarray) -> np.ndarray:
+    """Return the fillet that every pair is, -1 = none, and -1 for no pair, shape (P + 1,), i32."""
     number = np.full(len(chosen) + 1, NONE, np.int32)
-    number[fillets] = np.arange(len(fillets), dtype=np.int32)
-    sides = np.append(zones.pairs[fillets], [[NONE, NONE]], axis=0)
-    return sides[strips_of(search, number)]
+    number[:-1][chosen] = np.arange(np.count_nonzero(chosen), dtype=np.int32)
+    return number
 
 
 def smooth_pairs(search: Search, pairs: np.ndarray, turn: np.ndarray) -> np.ndarray:

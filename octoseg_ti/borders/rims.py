@@ -83,12 +83,12 @@ def scan_lines(
 def mark_rims(search: Search, lines: Lines, edge: np.ndarray) -> None:
     """Mark the points at rims as sharp, in place, where they are at no other edge."""
     label, spacing = search.label, search.spacing
-    around = Surroundings(search.device[0], search.leaves, search.box, _AROUND * spacing)
+    around = Surroundings(search.device[0], search.leaves, _AROUND * spacing)
     point, outward = find_rims(search, lines, edge, around)
     leaf = search.leaf_of(point)
     place = search.points[point]
     normal = normals_of(search, point, place)
-    base = find_base(place, normal, outward, label[point], search.box, spacing, search.noise)
+    base = find_base(place, normal, outward, label[point], search.leaves.box, spacing, search.noise)
     stands = np.zeros(len(point), bool)
     if base is not None:
         stands = np.isin(label[point], base.walls)

@@ -28,15 +28,17 @@ from octoseg_ti.borders.fillets import (
     fit_balls,
     guess_radii,
     look_around,
+    numbers_of,
     refit_sides,
     smooth_pairs,
     strip_pairs,
     strips_of,
 )
 from octoseg_ti.borders.rims import mark_rims
-from octoseg_ti.borders.zones import CAP, EDGE, Search, Zones, find_zones, ranges
+from octoseg_ti.borders.zones import CAP, EDGE, Search, Zones, find_zones
+from octoseg_ti.device import runtime
 from octoseg_ti.device.surfaces import distances_to_surfaces, evaluate_surfaces
-from octoseg_ti.stages.leaves import distinct
+from octoseg_ti.stages.leaves import distinct, ranges
 from octoseg_ti.stages.marking import nearest_marked
 from octoseg_ti.stages.profiles import BALL, FIRST, SECOND
 from octoseg_ti.stages.rims import Lines
@@ -94,8 +96,7 @@ def find_borders(search: Search, lines: Lines | None = None) -> Borders:
     fit = fit_balls(search, zones, around, guess, last=True)
     chosen = claim_points(search, zones, fit)
     fillets = np.flatnonzero(chosen)
-    number = np.full(len(zones.pairs) + 1, NONE, np.int32)
-    number[fillets] = np.arange(len(fillets), dtype=np.int32)
+    number = numbers_of(chosen)
     strip = strips_of(search, number)
     corners = find_corners(search, zones, fit, chosen)
     parts = parts_of(search, zones, corners, strip_pairs(search, zones, chosen))
@@ -195,7 +196,7 @@ def mark_points(
     key = distinct(key)
     pair, leaf = key // len(leaves), key % len(leaves)
     pair, leaf = pair[~idle[pair]], leaf[~idle[pair]]
-    box = search.box
+    box = leaves.box
     wide = 0.5 * np.linalg.norm(box[:, 3:] - box[:, :3], axis=1)
     kept = search.near_edge(
         zones.pairs, radius, 0.5 * (box[:, :3] + box[:, 3:]), leaf, pair, reach + wide[leaf]
@@ -212,7 +213,9 @@ def mark_points(
     sharp = np.flatnonzero(ours & ~(smooth | chosen)[pair])
     other = np.where(label == first, second, first)
     kind, parameters = search.table[:, 8].astype(np.int32), search.table[:, :8]
-    off = distances_to_surfaces(search.points[point[sharp]], other[sharp], kind, parameters)
+    off = distances_to_surfaces(
+        runtime.upload(search.points[point[sharp]]), other[sharp], kind, parameters
+    )
     ours[sharp] = np.abs(off) <= reach
     ours |= chosen[pair] & zones.allows(pair, label)
     point, pair, leaf, label, other = (a[ours] for a in (point, pair, leaf, label, other))
@@ -237,7 +240,7 @@ def mark_points(
         (np.flatnonzero(chosen[pair]), search.claim, pair),
     ):
         distance = nearest_marked(
-            search.device[0], marks, leaves, box, point[k], leaf[k], wanted[k], far[k]
+            search.device[0], marks, leaves, point[k], leaf[k], wanted[k], far[k]
         )
         found[k] = np.isfinite(distance)
     point, pair, along = point[found], pair[found], along[found]

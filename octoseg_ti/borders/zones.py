@@ -14,7 +14,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.surfaces import distances_to_surfaces, evaluate_surfaces
 from octoseg_ti.stages.extraction import Surfaces
 from octoseg_ti.stages.labelling import label_lists, near_lists
-from octoseg_ti.stages.leaves import Leaves, distinct, members_of
+from octoseg_ti.stages.leaves import Leaves, distinct, members_of, ranges
 from octoseg_ti.stages.profiles import BALL, NOWHERE, Places, place, sums
 from octoseg_ti.stages.sets import spread
 from octoseg_ti.types import NONE, SurfaceKind
@@ -122,7 +122,6 @@ class Search:
         self.claim = np.full(len(label), NONE, np.int32)
         # Points on the balls of corners, which say nothing about the tubes that end there.
         self.held = np.zeros(len(label), bool)
-        self.box = leaves.box
 
     def leaf_of(self, point: np.ndarray) -> np.ndarray:
         """Return the leaves that hold some points, shape (E,)."""
@@ -209,13 +208,6 @@ def listed(sets: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the members of all sets, and the set of each."""
     owner = np.repeat(np.arange(len(sets)), [len(s) for s in sets])
     return (np.concatenate(sets) if sets else np.zeros(0, np.int64)), owner
-
-
-def ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Return the numbers from every first on, so many each, one range after the other."""
-    ends = np.cumsum(count, dtype=np.int64)
-    total = int(ends[-1]) if len(ends) else 0
-    return np.arange(total) + np.repeat(first - (ends - count), count)
 
 
 def tasks(pairs: np.ndarray, pair: np.ndarray) -> np.ndarray:
@@ -338,7 +330,7 @@ def leaves_between(search: Search, triple: np.ndarray) -> tuple[np.ndarray, np.n
     cell, first = cell[order], np.searchsorted(name[order], np.arange(search.count + 1))
     each = (first[1:] - first[:-1])[triple[:, 0]]
     leaf, owner = cell[ranges(first[triple[:, 0]], each)], np.repeat(np.arange(len(triple)), each)
-    low, high = search.box[:, :3], search.box[:, 3:]
+    low, high = search.leaves.box[:, :3], search.leaves.box[:, 3:]
     wide = 0.5 * np.linalg.norm(high - low, axis=1)
     # How far fillets reach at most: the nearer ones are picked where points are placed.
     near = search.near_edge(

@@ -52,9 +52,8 @@ def refine(
         rounds=rounds, thin=False, leave=False,
     )  # fmt: skip
     found = to_parameters(state, centre, extent)[which, kind[which]]
-    if np.any(kind == SPHERE):
-        ball = kind[which] == SPHERE
-        found[ball, 3:6] = parameters[which[ball], 3:6]  # its axis means nothing
+    ball = kind[which] == SPHERE  # whose axis means nothing
+    found[ball, 3:6] = parameters[which[ball], 3:6]
     refined = parameters.copy()
     refined[which] = found
     return refined

@@ -14,7 +14,7 @@ from octoseg_ti.device.linalg import angle_of, row, vec3
 from octoseg_ti.device.runtime import F32Rows, F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.surfaces import surface_in_row
 from octoseg_ti.stages.grid import Grid
-from octoseg_ti.stages.leaves import Leaves, distinct
+from octoseg_ti.stages.leaves import Leaves, distinct, ranges
 from octoseg_ti.types import NONE
 
 MOST = 12
@@ -192,9 +192,7 @@ def label_lists(leaves: Leaves, label: np.ndarray) -> np.ndarray:
     one = common_label(leaves, label)
     mixed = np.flatnonzero(one < 0)
     count = leaves.count[mixed]
-    ends = np.cumsum(count)
-    point = np.arange(ends[-1] if len(ends) else 0)
-    point = point + np.repeat(leaves.first[mixed] - (ends - count), count)
+    point = ranges(leaves.first[mixed], count)
     return own_lists(
         leaves,
         np.concatenate([np.flatnonzero(one >= 0), np.repeat(mixed, count)]),

@@ -230,6 +230,13 @@ def distinct(key: np.ndarray) -> np.ndarray:
     return key[new]
 
 
+def ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Return the numbers from every first on, so many each, one range after the other."""
+    ends = np.cumsum(count, dtype=np.int64)
+    total = int(ends[-1]) if len(ends) else 0
+    return np.arange(total) + np.repeat(first - (ends - count), count)
+
+
 def members_of(label: np.ndarray, count: int) -> list[np.ndarray]:
     """Return the members of every label 0..count-1, ascending, an array of indices for each."""
     n = max(len(label), 1)

@@ -76,7 +76,6 @@ def nearest_marked(
     points: object,
     mark: np.ndarray,
     leaves: Leaves,
-    box: np.ndarray,
     point: np.ndarray,
     leaf: np.ndarray,
     wanted: np.ndarray,
@@ -93,7 +92,6 @@ def nearest_marked(
         points: Positions [mm], shape (n, 3) (kernel array).
         mark: Mark of every point, shape (n,), i32.
         leaves: The leaves.
-        box: Lower and upper corner of the points of every leaf [mm], shape (C, 6).
         point: Point of every entry, shape (E,).
         leaf: Its leaf, shape (E,).
         wanted: The mark that is looked for, shape (E,).
@@ -113,7 +111,7 @@ def nearest_marked(
         points,
         runtime.upload(marks),
         runtime.upload(np.stack([leaves.first, leaves.count, low, high], axis=1)),
-        runtime.upload(box),
+        runtime.upload(leaves.box),
         runtime.upload(leaves.start),
         runtime.upload(leaves.neighbor),
         runtime.upload(np.stack([point, leaf, wanted], axis=1).astype(np.int32)),

@@ -5,7 +5,7 @@ import numpy as np
 from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.stages.labelling import common_label
-from octoseg_ti.stages.leaves import Leaves, Samples, distinct, members_of
+from octoseg_ti.stages.leaves import Leaves, Samples, distinct, members_of, ranges
 from octoseg_ti.stages.sets import Surfaces, capped_rms, fit_sets, spread
 from octoseg_ti.types import NONE
 
@@ -284,8 +284,8 @@ def pieces(
     Args:
         leaves: The leaves.
         own: Surfaces with points in every leaf, ascending, then -1; shape (C, most), i32.
-        box: Lower and upper corner of the points of every entry that is one, row by row (`boxes`)
-            [mm], shape (k, 6); None = these do not count.
+        box: Lower and upper corner of the points of every entry that is one, row by row [mm], shape
+            (k, 6), by `entry_boxes`; None = these do not count.
         gap: Largest distance of the boxes of two entries of one piece [mm].
 
     Returns:
@@ -324,7 +324,9 @@ def pieces(
     return piece.reshape(own.shape)
 
 
-def boxes(points: np.ndarray, leaves: Leaves, own: np.ndarray, label: np.ndarray) -> np.ndarray:
+def entry_boxes(
+    points: np.ndarray, leaves: Leaves, own: np.ndarray, label: np.ndarray
+) -> np.ndarray:
     """Return the box around the points of every surface in every leaf [mm], shape (k, 6).
 
     Args:
@@ -342,9 +344,7 @@ def boxes(points: np.ndarray, leaves: Leaves, own: np.ndarray, label: np.ndarray
     box = leaves.box[cell].copy()
     several = np.flatnonzero((own[:, 1] >= 0) | (common_label(leaves, label) < 0))
     count = leaves.count[several]
-    ends = np.cumsum(count)
-    mine = np.arange(ends[-1] if len(ends) else 0)
-    mine = mine + np.repeat(leaves.first[several] - (ends - count), count)
+    mine = ranges(leaves.first[several], count)
     name = np.repeat(several, count) * width + label[mine]
     mine, name = mine[label[mine] >= 0], name[label[mine] >= 0]
     order = np.argsort(name, kind="stable")

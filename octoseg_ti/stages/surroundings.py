@@ -186,13 +186,12 @@ def _spread(
 class Surroundings:
     """Sorted points in their leaves, to look for those around some of them."""
 
-    def __init__(self, points: Any, leaves: Leaves, box: np.ndarray, radius: float) -> None:
+    def __init__(self, points: Any, leaves: Leaves, radius: float) -> None:
         """Bound blocks of points.
 
         Args:
             points: Sorted positions [mm], shape (n, 3) (kernel array).
             leaves: The leaves.
-            box: Lower and upper corner of the points of every leaf [mm], shape (C, 6).
             radius: Largest distance that will be asked for [mm].
         """
         runtime.ensure_started()
@@ -202,7 +201,7 @@ class Surroundings:
         self._points = points
         self._leaves = (
             runtime.upload(np.stack([leaves.first, leaves.count, small], axis=1).astype(np.int32)),
-            runtime.upload(box), blocks, runtime.upload(leaves.start),
+            runtime.upload(leaves.box), blocks, runtime.upload(leaves.start),
             runtime.upload(leaves.neighbor),
         )  # fmt: skip
 

@@ -95,7 +95,7 @@ def test_points_beside_a_blend_are_marked_and_stray_ones_are_not() -> None:
     label = np.repeat([0, 1], [len(flat), len(tube)]).astype(np.int32)
     stray = (label == 0) & (points[:, 0] < 2.0) & (np.arange(len(label)) % 7 == 0)
     label[stray] = 1
-    leaves, order, box = leaves_of(points, 0.5)
+    leaves, order = leaves_of(points, 0.5)
     points, label, stray = points[order], label[order], stray[order]
     runtime.ensure_started()
     table = np.array([surface(PLANE), surface(CYLINDER, radius)])
@@ -113,7 +113,6 @@ def test_points_beside_a_blend_are_marked_and_stray_ones_are_not() -> None:
         noise=0.002,
         spacing=step,
         leaves=leaves,
-        box=box,
         device=(runtime.upload(points),),
     )
     zones = Zones(

@@ -80,7 +80,7 @@ def rounded_corner(hollow: float, seed: int, *, sharp: bool = False) -> Searched
     label = np.concatenate([p[2] for p in parts]).astype(np.int32)
     claim = np.concatenate([np.full(len(p[0]), p[3]) for p in parts])
     claim[label == CONE] = NONE
-    leaves, order, box = leaves_of(point + AWAY, 0.5)
+    leaves, order = leaves_of(point + AWAY, 0.5)
     point, normal, label, claim = (a[order] for a in (point + AWAY, normal, label, claim))
     table = np.zeros((4, 10))
     for axis in range(3):
@@ -92,7 +92,7 @@ def rounded_corner(hollow: float, seed: int, *, sharp: bool = False) -> Searched
     return Searched(
         table=table, count=4, label=label, claim=claim, points=point, normals=normal, off=off,
         members=[np.flatnonzero(label == k) for k in range(4)], noise=NOISE, spacing=STEP,
-        size=np.bincount(label, minlength=4), leaves=leaves, box=box,
+        size=np.bincount(label, minlength=4), leaves=leaves,
         device=(runtime.upload(point), runtime.upload(normal)),
     )  # fmt: skip
 

@@ -45,7 +45,7 @@ def test_every_pair_keeps_about_so_many_points() -> None:
 def test_weak_points_need_others_near_them(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(0, 6, (600, 3)) * (1, 1, 0.3)
-    leaves, order, box = leaves_of(points, 1.0)
+    leaves, order = leaves_of(points, 1.0)
     points = points[order]
     mark = rng.integers(-1, 3, 600).astype(np.int32)
     weak = np.flatnonzero((mark >= 0) & (rng.random(600) < 0.9))
@@ -55,7 +55,6 @@ def test_weak_points_need_others_near_them(seed: int) -> None:
         noise=0.01,
         spacing=0.2,
         leaves=leaves,
-        box=box,
         device=(runtime.upload(points),),
         leaf_of=lambda point: np.searchsorted(leaves.first, point, side="right") - 1,
     )

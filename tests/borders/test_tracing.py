@@ -211,7 +211,7 @@ def strip_between(
     parameters[1, :6] = *(CORNER + np.array([0, radius, 0])), 0, 1, 0
     parameters[2, :7] = *(CORNER - np.array([0, 0, radius])), 1, 0, 0, radius
     kind = [SurfaceKind.PLANE, SurfaceKind.PLANE, SurfaceKind.CYLINDER]
-    leaves, order, _ = leaves_of(points, 0.45)
+    leaves, order = leaves_of(points, 0.45)
     runtime.ensure_started()
     search = Search(
         runtime.upload(points[order]), runtime.upload(normals[order]), leaves, label[order],

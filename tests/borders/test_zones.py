@@ -37,7 +37,7 @@ def lid() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def searched() -> Search:
     points, normals, label = lid()
     points += (10.0, 10.0, 6.0)
-    leaves, order, _ = leaves_of(points, 1.0)
+    leaves, order = leaves_of(points, 1.0)
     points, normals, label = points[order], normals[order], label[order]
     parameters = np.zeros((6, 8))
     parameters[0, :6] = (10, 10, 6, 0, 0, 1)
@@ -71,11 +71,13 @@ def test_of_a_strip_only_the_leaves_near_an_edge_belong_to_it() -> None:
     search = searched()
     triple = np.array([[5, 0, 1], [5, 0, 3]])
     owner, leaf = leaves_between(search, triple)
-    middle = 0.5 * (search.box[leaf, :3] + search.box[leaf, 3:]) - (10.0, 10.0, 6.0)
+    middle = 0.5 * (search.leaves.box[leaf, :3] + search.leaves.box[leaf, 3:]) - (10.0, 10.0, 6.0)
     holds = (search.own == 5).any(axis=1)
     for k, sign in enumerate((1.0, -1.0)):
         mine = leaf[owner == k]
         assert np.all(holds[mine]) and len(np.unique(mine)) == len(mine)
-        here = holds & (sign * (search.box[:, 0] - 10.0) > WIDE - 1.0)
-        assert set(np.flatnonzero(here & (sign * (search.box[:, 3] - 10.0) > WIDE))) <= set(mine)
+        here = holds & (sign * (search.leaves.box[:, 0] - 10.0) > WIDE - 1.0)
+        assert set(np.flatnonzero(here & (sign * (search.leaves.box[:, 3] - 10.0) > WIDE))) <= set(
+            mine
+        )
     assert np.all(middle[owner == 0, 0] > middle[owner == 1, 0].min())

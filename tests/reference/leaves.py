@@ -7,8 +7,8 @@ import numpy as np
 from octoseg_ti.stages.leaves import Leaves
 
 
-def leaves_of(points: np.ndarray, size: float) -> tuple[Leaves, np.ndarray, np.ndarray]:
-    """Cells of one size as leaves, the order of the points by cells, and the box of each."""
+def leaves_of(points: np.ndarray, size: float) -> tuple[Leaves, np.ndarray]:
+    """Cells of one size as leaves, and the order of the points by cells."""
     cell = np.floor(points / size).astype(np.int64)
     cell -= cell.min(axis=0)
     shape = tuple(cell.max(axis=0) + 1)
@@ -28,4 +28,4 @@ def leaves_of(points: np.ndarray, size: float) -> tuple[Leaves, np.ndarray, np.n
         count=count.astype(np.int32), size=np.full(len(name), size), box=box, a=a.astype(np.int32),
         b=b.astype(np.int32), start=start, neighbor=other.astype(np.int32),
     )  # fmt: skip
-    return leaves, order, box
+    return leaves, order

@@ -15,7 +15,7 @@ from octoseg_ti.stages.marking import nearest_marked
 def test_equal_the_reference(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(0, 6, (700, 3)) * (1, 1, 0.3)
-    leaves, order, box = leaves_of(points, 1.0)
+    leaves, order = leaves_of(points, 1.0)
     points = points[order]
     mark = rng.choice([-1, 0, 1, 7], 700, p=[0.4, 0.3, 0.29, 0.01]).astype(np.int32)
     asked = rng.integers(0, 700, 200)
@@ -24,22 +24,22 @@ def test_equal_the_reference(seed: int) -> None:
     reach = rng.uniform(0.1, 0.99, 200)
     runtime.ensure_started()
     device = runtime.upload(points)
-    got = nearest_marked(device, mark, leaves, box, asked, leaf, wanted, reach, exact=True)
+    got = nearest_marked(device, mark, leaves, asked, leaf, wanted, reach, exact=True)
     expected = [
         rolling.nearest(points, mark, i, w, r) for i, w, r in zip(asked, wanted, reach, strict=True)
     ]
     np.testing.assert_allclose(got, expected)
-    some = nearest_marked(device, mark, leaves, box, asked, leaf, wanted, reach)
+    some = nearest_marked(device, mark, leaves, asked, leaf, wanted, reach)
     np.testing.assert_array_equal(np.isfinite(some), np.isfinite(expected))
     assert 0 < np.isfinite(expected).sum() < 200
 
 
 def test_nothing_asked_nothing_found() -> None:
-    leaves, _, box = leaves_of(np.zeros((3, 3)), 1.0)
+    leaves, _ = leaves_of(np.zeros((3, 3)), 1.0)
     none = np.zeros(0, np.int64)
     runtime.ensure_started()
     points = runtime.upload(np.zeros((3, 3)))
-    assert len(nearest_marked(points, np.zeros(3), leaves, box, none, none, none, none)) == 0
+    assert len(nearest_marked(points, np.zeros(3), leaves, none, none, none, none)) == 0
     one = np.zeros(1, np.int64)
-    far = nearest_marked(points, np.full(3, 2), leaves, box, one, one, one + 5, np.ones(1))
+    far = nearest_marked(points, np.full(3, 2), leaves, one, one, one + 5, np.ones(1))
     assert math.isinf(far[0])

@@ -11,9 +11,9 @@ from octoseg_ti.device import runtime
 from octoseg_ti.stages.labelling import label_lists, own_lists
 from octoseg_ti.stages.leaves import Leaves, members_of, sample_leaves
 from octoseg_ti.stages.merging import (
-    boxes,
     contacts,
     cut_out,
+    entry_boxes,
     explained_by_others,
     merge_surfaces,
     pieces,
@@ -68,7 +68,7 @@ def test_points_of_one_piece_are_no_farther_apart_than_the_gap(seed: int, gap: f
     label = rng.integers(-1, 2, len(leaves))[leaf]
     label = np.where(rng.random(900) < 0.2, rng.integers(-1, 3, 900), label).astype(np.int32)
     own = label_lists(leaves, label)
-    box = boxes(point, leaves, own, label)
+    box = entry_boxes(point, leaves, own, label)
     points = {
         (c, s): point[(leaf == c) & (label == s)] for c, m in enumerate(as_lists(own)) for s in m
     }
@@ -83,14 +83,14 @@ def test_points_of_one_piece_are_no_farther_apart_than_the_gap(seed: int, gap: f
 def test_a_large_leaf_with_a_stray_point_links_nothing() -> None:
     # Two faces of one plane, three apart, and between them one leaf of something else.
     x, y = (a.ravel() for a in np.mgrid[0.05:9.0:0.1, 0.05:3.0:0.1])
-    leaves, order, _ = leaves_of(np.column_stack([x, y, 0.0 * x]), 3.0)
+    leaves, order = leaves_of(np.column_stack([x, y, 0.0 * x]), 3.0)
     points = np.column_stack([x, y, 0.0 * x])[order]
     label = np.where((points[:, 0] < 3.0) | (points[:, 0] > 6.0), 0, 1).astype(np.int32)
     label[np.flatnonzero(label == 1)[np.argmin(points[label == 1, 0])]] = 0
     own = label_lists(leaves, label)
     assert [row[row >= 0].tolist() for row in own] == [[0], [0, 1], [0]]
     assert len(np.unique(pieces(leaves, own)[own == 0])) == 1
-    near = pieces(leaves, own, boxes(points, leaves, own, label), 1.0)
+    near = pieces(leaves, own, entry_boxes(points, leaves, own, label), 1.0)
     assert len(np.unique(near[own == 0])) == 2
 
 

@@ -42,7 +42,7 @@ def random_scene(seed: int, n: int = 500) -> Scene:
     """Return points in a flat box, and surfaces through it that touch and that cross."""
     rng = np.random.default_rng(seed)
     point = rng.uniform(0.0, (4.0, 4.0, 2.0), (n, 3))
-    leaves, order, _ = leaves_of(point, 1.0)
+    leaves, order = leaves_of(point, 1.0)
     kind = np.array([PLANE, PLANE, CYLINDER, SPHERE, CYLINDER, TORUS], np.int32)
     parameters = np.array([
         (0, 0, 1, 0, 0, 1, NAN, NAN),
@@ -63,7 +63,7 @@ def two_surfaces(
     point: np.ndarray, kind: np.ndarray, parameters: np.ndarray, cell: float
 ) -> tuple[Scene, np.ndarray]:
     """Return points that took the nearer one of two surfaces, and where these rows came from."""
-    leaves, order, _ = leaves_of(point, cell)
+    leaves, order = leaves_of(point, cell)
     point = point[order]
     far = [np.abs(distance_of(point, kind[s], parameters[s])) / NOISE for s in range(2)]
     label = (far[1] < far[0]).astype(np.int32)

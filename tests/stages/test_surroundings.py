@@ -13,11 +13,11 @@ def surroundings(
     points: np.ndarray, size: float, radius: float
 ) -> tuple[Surroundings, np.ndarray, np.ndarray]:
     """The points in leaves: what to ask, the sorted points, and the leaf of each."""
-    leaves, order, box = leaves_of(points, size)
+    leaves, order = leaves_of(points, size)
     points = points[order]
     leaf = np.repeat(np.arange(len(leaves)), leaves.count)
     runtime.ensure_started()
-    return Surroundings(runtime.upload(points), leaves, box, radius), points, leaf
+    return Surroundings(runtime.upload(points), leaves, radius), points, leaf
 
 
 @pytest.mark.parametrize("seed", range(3))
