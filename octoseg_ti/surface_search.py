@@ -16,6 +16,7 @@ from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
 from octoseg_ti.fitting.covariance import covariances
 from octoseg_ti.fitting.refining import refine
+from octoseg_ti.stages.contacts import smooth_contacts
 from octoseg_ti.stages.extraction import Tolerance, explain
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import (
@@ -27,7 +28,7 @@ from octoseg_ti.stages.labelling import (
     surface_table,
 )
 from octoseg_ti.stages.leaves import Leaves, Samples, joined_samples, members_of, sample_leaves
-from octoseg_ti.stages.merging import cut_out, explained_by_others, merge_surfaces, smooth_contacts
+from octoseg_ti.stages.merging import cut_out, explained_by_others, merge_surfaces
 from octoseg_ti.stages.rounds import hidden_rounds, refitted_rounds
 from octoseg_ti.stages.sets import (
     Surfaces,
@@ -62,6 +63,9 @@ _LEFT_POINTS, _LEFT_SHARE = 2, 3
 _REFIT, _FEWEST = 300, 10
 # ... away from other surfaces, if there are so many of these.
 _INNER = 40
+# What a surface was fitted to tells as much as what it has now when it has kept this share of that,
+# and has no more than so many times that.
+_SAME, _MORE = 0.95, 1.25
 # Samples when it is settled which points are its own, and of one leaf at most.
 _SETTLED, _DENSE = 600, 32
 _MERGES = 8
@@ -96,6 +100,8 @@ class _Search:
         self.limit = limit
         self.samples = sample_leaves(grid, leaves, _SAMPLES)
         self.surfaces = no_surfaces()
+        # The surface that every sample was fitted by, -1 = none.
+        self.fitted = np.full(len(self.samples), NONE, np.int32)
         self.own = own_lists(leaves, np.zeros(0, np.int64), np.zeros(0, np.int64))
         self.labelling = Labelling(grid, leaves, rule)
         self._label: np.ndarray | None = None
@@ -175,6 +181,8 @@ class _Search:
                 self.face[samples.leaf[members]] |= not apart
         if len(new) == 0:
             return False
+        if samples is self.samples:
+            self.fitted = np.where(label >= 0, label + len(self.surfaces), self.fitted)
         self.join(new, samples.leaf, label)
         return True
 
@@ -190,8 +198,10 @@ class _Search:
         self.surfaces = self.surfaces.joined(new)
 
     def refit(self) -> None:
-        """Fit the surfaces anew to the samples that chose them."""
+        """Fit the surfaces anew to the samples that chose them, if they were fitted to others."""
         label = self.label[self.samples.index]
+        changed = self.changed(label)
+        self.fitted = np.where(changed[label], label, self.fitted)
         members = members_of(label, len(self.surfaces))
         # Points beside other surfaces may belong to these: where there are enough, others count.
         inner = members_of(
@@ -201,7 +211,8 @@ class _Search:
             i if len(i) >= _INNER and 4 * len(i) >= len(m) else m
             for i, m in zip(inner, members, strict=True)
         ]
-        which = np.array([m for m, s in enumerate(members) if len(s) >= _FEWEST], np.int64)
+        many = np.array([len(m) >= _FEWEST for m in members], bool)
+        which = np.flatnonzero(many & changed[:-1])
         sets = [spread(members[m], _REFIT) for m in which]
         noise = self.tolerance.noise
         fitted, fits = fit_sets(self.samples, sets, noise, robust=True)
@@ -212,6 +223,22 @@ class _Search:
             if new[k].mean() >= old[k].mean() - 0.01:
                 kind[which[f]], parameters[which[f]] = fits.kind[k], fits.parameters[k]
         self.surfaces = Surfaces(kind=kind, parameters=parameters)
+
+    def changed(self, label: np.ndarray) -> np.ndarray:
+        """Return which surfaces have other samples than they were fitted to.
+
+        Args:
+            label: Surface of every sample, -1 = none, shape (A,), i32.
+
+        Returns:
+            Shape (M + 1,), bool; no, for none, at the end.
+        """
+        count = len(self.surfaces)
+        before, now, both = (
+            np.bincount(of + 1, minlength=count + 1)[1:]
+            for of in (self.fitted, label, np.where(self.fitted == label, label, NONE))
+        )
+        return np.append((both < _SAME * before) | (now > _MORE * before), False)
 
     def refit_settled(self) -> np.ndarray:
         """Fit the surfaces to more of their points, up to the edges: these are settled now.
@@ -300,14 +327,14 @@ class _Search:
     def merge(self) -> bool:
         """Merge surfaces that are one; say whether there were any."""
         label = self.label[self.samples.index]
-        pairs = smooth_contacts(self.leaves, self.own, self.samples, self.surfaces)
-        self.meeting = pairs
+        touching = smooth_contacts(self.leaves, self.own, self.samples, self.surfaces)
+        self.meeting = pairs = touching.pairs
         key = pairs[:, 0] * len(self.surfaces) + pairs[:, 1]
         name, self.surfaces = merge_surfaces(
             self.samples,
             label,
             self.surfaces,
-            pairs[~np.isin(key, self.apart)],
+            touching.some(~np.isin(key, self.apart)),
             self.tolerance.noise,
         )
         changed = name != np.arange(len(name))

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.device.unionfind import components
+from octoseg_ti.stages.contacts import Contacts, only_surface
 from octoseg_ti.stages.labelling import common_label
-from octoseg_ti.stages.leaves import Leaves, Samples, distinct, members_of, ranges
+from octoseg_ti.stages.leaves import Leaves, Samples, members_of, ranges
 from octoseg_ti.stages.sets import Surfaces, capped_rms, fit_sets, spread
 from octoseg_ti.types import NONE
 
@@ -21,8 +21,9 @@ _FIT = 1.2
 _CAP = 4.0
 # A surface with fewer samples says nothing about another.
 _FEW = 10
-# Surfaces whose normals differ by more than this where they meet [rad] meet at an edge.
-_EDGE = 0.7
+# One surface has one tangent plane where two pieces of it touch. What the noise hides bends a piece
+# by four times the noise, over its width, at its rim; twice that, and so many noises, are no edge.
+_TURN, _STEP = 8.0, 6.0
 _UNIT = 1024.0
 # What deviates by no more than this many noises and tilts, and is no larger than this share of the
 # surface beside it, is an error of its form: of that one, and no round between it and the next.
@@ -32,78 +33,8 @@ _FORM, _SMOOTH, _SMALL, _LEANS = 4.0, 3.0, 0.25, 0.8
 _CUT_OUT = 1.1
 
 
-def contacts(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pairs of surfaces that have points in one leaf or in leaves that touch.
-
-    Args:
-        leaves: The leaves.
-        own: Surfaces with points in every leaf, ascending, then -1; shape (C, most), i32.
-
-    Returns:
-        The pairs, smaller number first, ascending, shape (P, 2); and how many leaves and pairs of
-        leaves each was found in, shape (P,).
-    """
-    one, other, _ = _touches(leaves, own)
-    key, count = np.unique(_keys(one, other, own), return_counts=True)
-    return _pairs_of(key, own), count
-
-
-def smooth_contacts(
-    leaves: Leaves, own: np.ndarray, samples: Samples, surfaces: Surfaces
-) -> np.ndarray:
-    """Return the pairs of surfaces that do not meet at an edge: only these can be one.
-
-    Args:
-        leaves: The leaves.
-        own: As of `contacts`.
-        samples: Samples of all leaves, in their order.
-        surfaces: The surfaces.
-
-    Returns:
-        Of the pairs of `contacts` those whose normals agree somewhere where they touch.
-    """
-    one, other, leaf = _touches(leaves, own)
-    point = samples.point[np.searchsorted(samples.leaf, leaf)]
-    _, n = evaluate_surfaces(point, one, surfaces.kind, surfaces.parameters)
-    _, m = evaluate_surfaces(point, other, surfaces.kind, surfaces.parameters)
-    smooth = np.abs(np.einsum("ij,ij->i", n, m)) >= np.cos(_EDGE)
-    return _pairs_of(distinct(_keys(one, other, own)[smooth]), own)
-
-
-def _touches(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return two surfaces, and a leaf, for every place where these touch."""
-    held = (own >= 0).sum(axis=1)
-    cells = np.arange(len(own), dtype=np.int32)
-    a, b = np.concatenate([leaves.a, cells]), np.concatenate([leaves.b, cells])
-    only = _only(own)
-    some = (only[a] < 0) | (only[a] != only[b])
-    some[some] = (held[a[some]] > 0) & (held[b[some]] > 0)
-    a, b = a[some], b[some]
-    each = held[a] * held[b]
-    at = np.repeat(np.arange(len(a)), each)
-    rank = np.arange(len(at)) - np.repeat(np.cumsum(each) - each, each)
-    one, other = own[a[at], rank // held[b[at]]], own[b[at], rank % held[b[at]]]
-    differ = one != other
-    return one[differ], other[differ], a[at[differ]]
-
-
-def _only(own: np.ndarray) -> np.ndarray:
-    """Return the surface of leaves that have one, -1 of others, shape (C,)."""
-    return np.where(own[:, 1] < 0, own[:, 0], NONE)
-
-
-def _keys(one: np.ndarray, other: np.ndarray, own: np.ndarray) -> np.ndarray:
-    width = int(own.max(initial=0)) + 1
-    return np.minimum(one, other).astype(np.int64) * width + np.maximum(one, other)
-
-
-def _pairs_of(key: np.ndarray, own: np.ndarray) -> np.ndarray:
-    width = int(own.max(initial=0)) + 1
-    return np.stack([key // width, key % width], axis=1)
-
-
 def merge_surfaces(
-    samples: Samples, label: np.ndarray, surfaces: Surfaces, pairs: np.ndarray, noise: float
+    samples: Samples, label: np.ndarray, surfaces: Surfaces, touching: Contacts, noise: float
 ) -> tuple[np.ndarray, Surfaces]:
     """Merge surfaces in contact that one surface explains as well.
 
@@ -111,7 +42,7 @@ def merge_surfaces(
         samples: The samples.
         label: Surface of every sample, -1 = none, shape (A,), i32.
         surfaces: The surfaces.
-        pairs: Surfaces in contact, shape (P, 2).
+        touching: Surfaces in contact.
         noise: Deviation of a point from its surface [mm].
 
     Returns:
@@ -121,10 +52,11 @@ def merge_surfaces(
     name = np.arange(len(surfaces), dtype=np.int32)
     members = members_of(label, len(surfaces))
     size = np.array([len(m) for m in members], np.int64)
-    pairs = pairs[(size[pairs] >= _FEW).all(axis=1)]
+    touching = touching.some((size[touching.pairs] >= _FEW).all(axis=1))
+    parts = [spread(m, _SAMPLES) for m in members]
+    pairs = _without_edges(samples, parts, touching, noise)
     if len(pairs) == 0:
         return name, surfaces
-    parts = [spread(m, _SAMPLES) for m in members]
     groups = [np.concatenate([parts[a], parts[b]]) for a, b in pairs]
     fitted, common = fit_sets(samples, groups, noise)
     if len(fitted) == 0:
@@ -144,6 +76,29 @@ def merge_surfaces(
         name[drop] = keep
         parameters[keep], kind[keep] = common.parameters[p], common.kind[p]
     return name, Surfaces(kind=kind, parameters=parameters)
+
+
+def _without_edges(
+    samples: Samples, parts: list[np.ndarray], touching: Contacts, noise: float
+) -> np.ndarray:
+    """Return the pairs without those that meet at an edge or a step, shape (P, 2)."""
+    used = np.unique(touching.pairs)
+    width = np.zeros(len(parts))
+    width[used] = [_width(samples.point[parts[m]]) for m in used]
+    bend = noise / np.maximum(width[touching.pairs], 1e-300)
+    smooth = (touching.turn <= _TURN * bend.sum(axis=1)) & (touching.step <= _STEP * noise)
+    return touching.pairs[smooth]
+
+
+def _width(point: np.ndarray) -> float:
+    """Return how wide a piece of a surface is, where it is longer than wide [mm].
+
+    Args:
+        point: Points all over it, shape (k, 3).
+    """
+    q = point - point.mean(axis=0)
+    square = np.einsum("ki,kj->ij", q, q) / len(q)
+    return float(np.sqrt(12.0 * max(np.linalg.eigvalsh(square)[1], 0.0)))
 
 
 def _residuals(
@@ -297,7 +252,7 @@ def pieces(
     number = np.full(own.size, NONE, np.int64)
     number[entry] = np.arange(len(entry))
     table = number.reshape(own.shape)
-    only = _only(own)
+    only = only_surface(own)
     alike = (only[leaves.a] >= 0) & (only[leaves.a] == only[leaves.b])
     ends_a, ends_b = [table[leaves.a[alike], 0]], [table[leaves.b[alike], 0]]
     left_a, left_b = leaves.a[~alike], leaves.b[~alike]

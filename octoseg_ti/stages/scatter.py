@@ -5,8 +5,8 @@ lies on a surface is more than that: steps of the range, speckle over several po
 not quite meet. It is measured where it matters, as the residual of the best analytic surface
 through neighbourhoods of about a hundred points of one region: of half of them, for edges run
 through some of the others. (Where faces are a few neighbourhoods large, edges would run through
-nearly all if regions did not keep them apart.) A quadric does for most of them; where it bends too
-much, surfaces are fitted.
+nearly all if regions did not keep them apart.) A quadric does for most of them; where many bend too
+much for one, surfaces are fitted.
 
 Poses are in error from view to view, not from point to point: in one place views meet well, in
 another they do not, and in most there may be one view only. So where views meet, the scatter of
@@ -20,6 +20,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.fitting.primitives import FREEDOM, fit_all
 from octoseg_ti.fitting.quadrics import QUADRIC_FREEDOM, Quadrics, fit_quadrics
 from octoseg_ti.stages.grid import Grid
+from octoseg_ti.stages.leaves import ranges
 
 # Neighbourhoods, and the points of each.
 _COUNT, _POINTS = 256, 128
@@ -30,6 +31,8 @@ _WINDOW = 4
 _CALM, _MIDDLE, _EDGES = 0.25, 0.6, 1.5
 # A quadric is no surface any more where it turns by so much from the middle to the rim [rad].
 _BEND = 0.35
+# Up to this share of the neighbourhoods may bend so much: then the others tell alone.
+_BENT = 0.25
 # Where it leaves so many times what it leaves of the calm ones, there is an edge.
 _EDGE = 8.0
 # Views are apart by this quantile of what they are where they meet, if they do in so many places.
@@ -56,38 +59,57 @@ def surface_noise(
     Returns:
         Both deviations; None where no region is large enough to tell.
     """
-    key = runtime.download(grid.key)
-    region = np.repeat(group, grid.holds[leaves])
-    inside = np.flatnonzero(region >= 0)
-    if len(inside) == 0:
+    index, begin = _neighborhoods(runtime.download(grid.key), np.repeat(group, grid.holds[leaves]))
+    count = np.diff(begin)
+    if len(count) == 0:
         return None
-    # Whole boxes: which points of a box come first would depend on the order of the input.
-    starts = np.unique(np.searchsorted(key, key[inside[np.arange(_COUNT) * len(inside) // _COUNT]]))
-    ends = np.searchsorted(key, key[np.minimum(starts + _WINDOW * _POINTS, len(key) - 1)])
-    found: dict[tuple[int, int], np.ndarray] = {}
-    for first, last in zip(starts, ends, strict=True):
-        mine = first + np.flatnonzero(region[first:last] == region[first])
-        if len(mine) > _POINTS:
-            mine = mine[: np.searchsorted(key[mine], key[mine[_POINTS - 1]], "right")]
-        if len(mine) >= _FEWEST and region[first] >= 0:
-            found[int(mine[0]), int(mine[-1])] = mine
-    if not found:
-        return None
-    count = np.array([len(mine) for mine in found.values()])
-    begin = np.cumsum(count) - count
-    index = np.concatenate(list(found.values()))
-    point = runtime.download(grid.point)[index]
-    order = _shuffled(point, np.repeat(np.arange(len(count)), count))
-    point, normal = point[order], runtime.download(grid.normal)[index[order]]
-    rms, bent = _residuals(point, normal, np.append(begin, len(index)))
-    seen = view[runtime.download(grid.order)[index[order]]]
     owner = np.repeat(np.arange(len(count)), count)
+    index = index[_shuffled(runtime.download(grid.point).take(index, axis=0), owner)]
+    point = runtime.download(grid.point).take(index, axis=0)
+    normal = runtime.download(grid.normal).take(index, axis=0)
+    seen = view[runtime.download(grid.order)[index]]
+    rms, bent = _residuals(point, normal, begin)
     # Where a quadric does, quadrics do for the views too; half of the places tell enough.
     asked = ~bent[owner] & (owner % 2 == 0)
     within, apart = _by_view(point[asked], normal[asked], seen[asked], owner[asked], rms)
     if apart <= _CHANCE * within:
         return _typical(rms), 0.0
     return max(_typical(rms), float(np.hypot(within, apart))), apart
+
+
+def _neighborhoods(key: np.ndarray, region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return neighbourhoods all over a part, each within one region.
+
+    Args:
+        key: Morton keys of the sorted points, shape (n,).
+        region: Region of every sorted point, -1 = none, shape (n,).
+
+    Returns:
+        The sorted points of each, one neighbourhood after the other, ascending, shape (S,); and the
+        first of these of every neighbourhood, and S at the end, shape (G + 1,).
+    """
+    inside = np.flatnonzero(region >= 0)
+    if len(inside) == 0:
+        return inside, np.zeros(1, np.int64)
+    # Whole boxes: which points of a box come first would depend on the order of the input.
+    first = np.unique(np.searchsorted(key, key[inside[np.arange(_COUNT) * len(inside) // _COUNT]]))
+    first = first[region[first] >= 0]
+    last = np.searchsorted(key, key[np.minimum(first + _WINDOW * _POINTS, len(key) - 1)])
+    index, owner = ranges(first, last - first), np.repeat(np.arange(len(first)), last - first)
+    index, owner = _some(region[index] == region[first][owner], index, owner)
+    count = np.bincount(owner, minlength=len(first))
+    ends = np.cumsum(count)
+    farthest = key[index[np.minimum(ends - count + _POINTS, ends) - 1]]
+    index, owner = _some(key[index] <= farthest[owner], index, owner)
+    count = np.bincount(owner, minlength=len(first))
+    index, _ = _some(count[owner] >= _FEWEST, index, owner)
+    return index, np.append(0, np.cumsum(count[count >= _FEWEST]))
+
+
+def _some(kept: np.ndarray, *rows: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return some of the rows of each array."""
+    where = np.flatnonzero(kept)
+    return tuple(array[where] for array in rows)
 
 
 def _shuffled(point: np.ndarray, group: np.ndarray) -> np.ndarray:
@@ -103,7 +125,7 @@ def _shuffled(point: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 def _typical(rms: np.ndarray) -> float:
     """Return what surfaces leave of a usual neighbourhood without an edge [mm]."""
-    calm, middle = np.quantile(rms, [_CALM, _MIDDLE])
+    calm, middle = np.nanquantile(rms, [_CALM, _MIDDLE])
     return float(min(middle, _EDGES * calm))
 
 
@@ -160,6 +182,8 @@ def _residuals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what the surface through every group leaves [mm], and whether it is bent, shapes (G,).
 
+    A few bent ones are left out: NaN.
+
     Args:
         point: Points of the groups, one group after the other [mm], shape (S, 3).
         normal: Their normals, shape (S, 3).
@@ -169,7 +193,9 @@ def _residuals(
     found = fit_quadrics(point, normal, start)
     rms = _of_quadrics(found, count)
     bent = (found.bend > _BEND) & (rms <= _EDGE * np.quantile(rms, _CALM))
-    if bent.any():
+    if np.count_nonzero(bent) <= _BENT * len(bent):
+        rms[bent] = np.nan
+    else:
         mine = np.repeat(bent, count)
         ends = np.concatenate([[0], np.cumsum(count[bent])]).astype(np.int32)
         fit = fit_all(point[mine], normal[mine], None, ends)
