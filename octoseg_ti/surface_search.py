@@ -32,6 +32,7 @@ from octoseg_ti.stages.merging import cut_out, explained_by_others, merge_surfac
 from octoseg_ti.stages.rounds import hidden_rounds, refitted_rounds
 from octoseg_ti.stages.sets import (
     Surfaces,
+    apart,
     fit_sets,
     flat_sets,
     lie_on,
@@ -66,6 +67,8 @@ _INNER = 40
 # What a surface was fitted to tells as much as what it has now when it has kept this share of that,
 # and has no more than so many times that.
 _SAME, _MORE = 0.95, 1.25
+# A surface that moves by less, in noises, stays where it is.
+_MOVED = 0.2
 # Samples when it is settled which points are its own, and of one leaf at most.
 _SETTLED, _DENSE = 600, 32
 _MERGES = 8
@@ -171,7 +174,8 @@ class _Search:
         if turn is not None:
             tolerance = tolerance._replace(turn=turn)
         # A line has no normals, and is no surface.
-        sets = [s for s in sets if 2 * np.count_nonzero(samples.normal[s].any(axis=1)) > len(s)]
+        known = samples.normal.any(axis=1)
+        sets = [s for s in sets if 2 * np.count_nonzero(known[s]) > len(s)]
         new, label = explain(samples, self.leaves, sets, tolerance, apart=apart)
         for members in sets:
             large = samples.weight[members].sum() >= FREE * self.tolerance.points
@@ -217,10 +221,14 @@ class _Search:
         noise = self.tolerance.noise
         fitted, fits = fit_sets(self.samples, sets, noise, robust=True)
         new = lie_on(self.samples, sets, fitted, fits, 3.0 * noise, 0.5)
-        old = lie_on(self.samples, sets, fitted, self.surfaces.at(which[fitted]), 3.0 * noise, 0.5)
+        before = self.surfaces.at(which[fitted])
+        old = lie_on(self.samples, sets, fitted, before, 3.0 * noise, 0.5)
+        # What has hardly moved stays: nothing near it has to choose again.
+        moved = apart(self.samples, sets, fitted, before, fits) > _MOVED * noise
+        moved |= before.kind != fits.kind
         kind, parameters = self.surfaces.kind.copy(), self.surfaces.parameters.copy()
         for k, f in enumerate(fitted):
-            if new[k].mean() >= old[k].mean() - 0.01:
+            if moved[k] and new[k].mean() >= old[k].mean() - 0.01:
                 kind[which[f]], parameters[which[f]] = fits.kind[k], fits.parameters[k]
         self.surfaces = Surfaces(kind=kind, parameters=parameters)
 

@@ -14,7 +14,8 @@ from octoseg_ti.stages.extraction import Tolerance
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import Labelling, Rule, common_label, label_lists, surface_table
 from octoseg_ti.stages.leaves import Leaves, leaf_graph
-from octoseg_ti.stages.merging import entry_boxes, mean_squares, pieces
+from octoseg_ti.stages.merging import mean_squares
+from octoseg_ti.stages.pieces import entry_boxes, pieces
 from octoseg_ti.stages.settling import settle
 from octoseg_ti.surface_search import AROUND, EXPLAINED, FREE, NARROW, Surfaced, find_surfaces
 from octoseg_ti.types import NONE
@@ -152,10 +153,8 @@ def connected_pieces(
         gap: The longest edge of a triangle [mm]; pieces are no farther apart than a few of these.
             None = not known.
     """
-    if gap is None:
-        return pieces(leaves, found.own)
     box = entry_boxes(points, leaves, found.own, found.label)
-    return pieces(leaves, found.own, box, PIECE_GAPS * gap)
+    return pieces(leaves, found.own, box, np.inf if gap is None else PIECE_GAPS * gap)
 
 
 def number_pieces(

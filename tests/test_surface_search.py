@@ -50,3 +50,28 @@ def test_what_only_normals_hold_is_no_surface(rows: int, real: bool) -> None:
     search.give_up_slivers()
     after = np.bincount(search.label[search.label >= 0], minlength=2)
     assert (after[1] > 0) == real
+
+
+@pytest.mark.parametrize(
+    ("share", "raised", "anew"), [(1.0, 1.0, False), (0.5, 1.0, True), (0.0, 0.05, False)]
+)
+def test_a_surface_is_fitted_anew_where_its_samples_are_others(
+    share: float, raised: float, anew: bool
+) -> None:
+    search = strip(9, real=True)
+    search.refit()
+    before = search.surfaces.parameters
+    search.choose()
+    label = search.label[search.samples.index]
+    search.surfaces.parameters[0, 2] += raised * NOISE
+    search.choose()
+    rng = np.random.default_rng(0)
+    search.fitted = np.where(rng.random(len(label)) < share, label, -1).astype(np.int32)
+    moved = search.surfaces.parameters.copy()
+    search.refit()
+    np.testing.assert_array_equal(search.surfaces.parameters[1], before[1])
+    if not anew:
+        np.testing.assert_array_equal(search.surfaces.parameters[0], moved[0])
+        return
+    plane = search.surfaces.parameters[0]
+    assert abs((plane[:3] - moved[0, :3]) @ plane[3:6]) > 0.5 * raised * NOISE

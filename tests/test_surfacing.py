@@ -11,7 +11,7 @@ from reference.leaves import leaves_of
 from octoseg_ti import Scans, SurfaceKind, segment
 from octoseg_ti.stages.labelling import label_lists
 from octoseg_ti.stages.leaves import Leaves
-from octoseg_ti.stages.merging import pieces
+from octoseg_ti.stages.pieces import pieces
 from octoseg_ti.stages.sets import Surfaces
 from octoseg_ti.surface_search import EXPLAINED, FREE, Surfaced
 from octoseg_ti.surfacing import _with_free_forms, number_pieces
@@ -40,7 +40,8 @@ def band(ends: list[float], names: list[int]) -> tuple[Leaves, np.ndarray, np.nd
 def numbered(
     leaves: Leaves, found: Surfaced, least: float, fewest: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    return number_pieces(leaves, found, pieces(leaves, found.own), least, fewest)
+    boxes = np.zeros((np.count_nonzero(found.own >= 0), 6))  # none too far from another
+    return number_pieces(leaves, found, pieces(leaves, found.own, boxes, np.inf), least, fewest)
 
 
 def plain_numbers(

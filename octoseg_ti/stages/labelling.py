@@ -68,10 +68,16 @@ def _gather(
     closed_in: I32Array,
     start_in: I32Array,
     neighbor_in: I32Array,
+    before_in: I32Rows,
+    changed_in: I32Array,
     # Out:
     near_inout: I32Rows,
+    stale_out: I32Array,
 ):
-    """Collect the surfaces of every leaf that is not closed, and of the leaves that touch it."""
+    """Collect the surfaces of every leaf that is not closed, and of the leaves that touch it.
+
+    A leaf is stale that sees others than before, or one that has changed.
+    """
     for c in range(own_in.shape[0]):
         for k in range(MOST):
             near_inout[c, k] = -1
@@ -85,6 +91,14 @@ def _gather(
                 while k < MOST and own_in[b, k] >= 0:
                     _insert(near_inout, c, own_in[b, k])
                     k += 1
+        stale = 0
+        for k in range(MOST):
+            s = near_inout[c, k]
+            if s != before_in[c, k]:
+                stale = 1
+            elif s >= 0 and changed_in[s] != 0:
+                stale = 1
+        stale_out[c] = stale
 
 
 @ti.kernel
@@ -217,7 +231,10 @@ def near_lists(leaves: Leaves, own: np.ndarray) -> np.ndarray:
         runtime.zeros(len(own), np.int32),
         runtime.upload(leaves.start),
         runtime.upload(leaves.neighbor),
+        runtime.upload(own),
+        runtime.zeros(int(own.max(initial=NONE)) + 1, np.int32),
         near,
+        runtime.empty(len(own), np.int32),
     )
     return runtime.download(near)
 
@@ -252,7 +269,8 @@ class Labelling:
         self._start, self._neighbor = runtime.upload(leaves.start), runtime.upload(leaves.neighbor)
         self._leaf = runtime.upload(np.stack([leaves.first, leaves.count], axis=1))
         self._surfaces = np.zeros((0, 10))
-        self._near: np.ndarray | None = None
+        # What every leaf saw the last time: nothing that a list can hold.
+        self._near = runtime.upload(np.full((len(leaves), MOST), NONE - 1, np.int32))
         self._own = np.full((len(leaves), MOST), NONE, np.int32)
 
     def choose(
@@ -276,10 +294,15 @@ class Labelling:
         """
         shut = np.zeros(self.count, np.int32) if closed is None else closed.astype(np.int32)
         device_shut, device_surfaces = runtime.upload(shut), runtime.upload(surfaces)
+        changed = self._changed(surfaces)
         for _ in range(passes):
-            near = runtime.empty(own.shape, np.int32)
-            _gather(runtime.upload(own), device_shut, self._start, self._neighbor, near)
-            stale = self._stale(runtime.download(near), surfaces)
+            near, flag = runtime.empty(own.shape, np.int32), runtime.empty(len(own), np.int32)
+            _gather(
+                runtime.upload(own), device_shut, self._start, self._neighbor,
+                self._near, runtime.upload(changed), near, flag,
+            )  # fmt: skip
+            self._near, changed = near, np.zeros_like(changed)
+            stale = np.flatnonzero(runtime.download(flag)[: len(own)]).astype(np.int32)
             own = self._own.copy()
             if len(stale):
                 held = runtime.upload(own)
@@ -291,16 +314,11 @@ class Labelling:
             self._own = own
         return own
 
-    def _stale(self, near: np.ndarray, surfaces: np.ndarray) -> np.ndarray:
-        """Return the leaves that see other surfaces than the last time, ascending, i32."""
-        before, self._near = self._near, near
+    def _changed(self, surfaces: np.ndarray) -> np.ndarray:
+        """Return which surfaces are others than the last time, shape (M,), i32."""
         both = min(len(surfaces), len(self._surfaces))
-        changed = np.ones(len(surfaces) + 1, bool)
+        changed = np.ones(len(surfaces), np.int32)
         same = (surfaces[:both] == self._surfaces[:both]) | np.isnan(surfaces[:both])
         changed[:both] = ~same.all(axis=1)
-        changed[-1] = False  # of the -1 that ends a list
         self._surfaces = surfaces
-        if before is None:
-            return np.arange(len(near), dtype=np.int32)
-        stale = (near != before).any(axis=1) | changed[near].any(axis=1)
-        return np.flatnonzero(stale).astype(np.int32)
+        return changed

@@ -203,8 +203,8 @@ def sample_leaves(
     return Samples(
         index=picked,
         leaf=leaf,
-        point=runtime.download(grid.point)[picked],
-        normal=runtime.download(grid.normal)[picked],
+        point=runtime.download(grid.point).take(picked, axis=0),
+        normal=runtime.download(grid.normal).take(picked, axis=0),
         weight=np.repeat(there / np.maximum(each, 1), each),
         signed=grid.signed,
     )

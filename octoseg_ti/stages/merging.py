@@ -2,12 +2,9 @@
 
 import numpy as np
 
-from octoseg_ti.device.unionfind import components
-from octoseg_ti.stages.contacts import Contacts, only_surface
-from octoseg_ti.stages.labelling import common_label
-from octoseg_ti.stages.leaves import Leaves, Samples, members_of, ranges
+from octoseg_ti.stages.contacts import Contacts
+from octoseg_ti.stages.leaves import Samples, members_of
 from octoseg_ti.stages.sets import Surfaces, capped_rms, fit_sets, spread
-from octoseg_ti.types import NONE
 
 # Samples of each surface in a common fit.
 _SAMPLES = 150
@@ -229,85 +226,3 @@ def mean_squares(
         total = np.bincount(owner, np.minimum(square, limit), len(size)) + alone * limit
         means.append(total / _UNIT / np.maximum(size, 1))
     return means
-
-
-def pieces(
-    leaves: Leaves, own: np.ndarray, box: np.ndarray | None = None, gap: float = np.inf
-) -> np.ndarray:
-    """Return the connected pieces of the surfaces.
-
-    Args:
-        leaves: The leaves.
-        own: Surfaces with points in every leaf, ascending, then -1; shape (C, most), i32.
-        box: Lower and upper corner of the points of every entry that is one, row by row [mm], shape
-            (k, 6), by `entry_boxes`; None = these do not count.
-        gap: Largest distance of the boxes of two entries of one piece [mm].
-
-    Returns:
-        Piece of every entry of ``own``, shape (C, most), i32, -1 where that holds no surface. A
-        piece has the number of its first entry, of those that hold one counted row by row.
-    """
-    most = own.shape[1]
-    entry = np.flatnonzero(own.ravel() >= 0)
-    number = np.full(own.size, NONE, np.int64)
-    number[entry] = np.arange(len(entry))
-    table = number.reshape(own.shape)
-    only = only_surface(own)
-    alike = (only[leaves.a] >= 0) & (only[leaves.a] == only[leaves.b])
-    ends_a, ends_b = [table[leaves.a[alike], 0]], [table[leaves.b[alike], 0]]
-    left_a, left_b = leaves.a[~alike], leaves.b[~alike]
-    for k in range(most):  # where the two leaves of a pair share a surface
-        there = own[left_a, k] >= 0
-        if not there.any():
-            break
-        a, b = left_a[there], left_b[there]
-        same = own[b] == own[a, k][:, None]
-        hit = same.any(axis=1)
-        ends_a.append(table[a[hit], k])
-        ends_b.append(table[b[hit], same[hit].argmax(axis=1)])
-    one, other = np.concatenate(ends_a).astype(np.int32), np.concatenate(ends_b).astype(np.int32)
-    if box is not None:
-        # Leaves may touch whose points are far apart; and a large leaf that holds a few points of
-        # a surface reaches farther than these.
-        apart = np.maximum(box[one, :3] - box[other, 3:], box[other, :3] - box[one, 3:])
-        apart = np.maximum(apart, 0.0)
-        near = np.einsum("ij,ij->i", apart, apart) <= gap**2
-        one, other = one[near], other[near]
-    root = components(len(entry), one, other)
-    piece = np.full(own.size, NONE, np.int32)
-    piece[entry] = root
-    return piece.reshape(own.shape)
-
-
-def entry_boxes(
-    points: np.ndarray, leaves: Leaves, own: np.ndarray, label: np.ndarray
-) -> np.ndarray:
-    """Return the box around the points of every surface in every leaf [mm], shape (k, 6).
-
-    Args:
-        points: Sorted positions [mm], shape (n, 3), f64.
-        leaves: The leaves.
-        own: Surfaces with points in every leaf, ascending, then -1; shape (C, most), i32.
-        label: Surface of every sorted point, -1 = none, shape (n,), i32.
-
-    Returns:
-        Lower and upper corner for every entry of ``own`` that is one, row by row.
-    """
-    cell, rank = np.nonzero(own >= 0)
-    width = np.int64(own.max(initial=0)) + 1
-    key = cell * width + own[cell, rank]
-    box = leaves.box[cell].copy()
-    several = np.flatnonzero((own[:, 1] >= 0) | (common_label(leaves, label) < 0))
-    count = leaves.count[several]
-    mine = ranges(leaves.first[several], count)
-    name = np.repeat(several, count) * width + label[mine]
-    mine, name = mine[label[mine] >= 0], name[label[mine] >= 0]
-    order = np.argsort(name, kind="stable")
-    mine, name = mine[order], name[order]
-    first = np.flatnonzero(np.diff(name, prepend=-1))
-    at = np.minimum(np.searchsorted(key, name[first]), max(len(key) - 1, 0))
-    held = key[at] == name[first]  # the lists have an end
-    low = np.minimum.reduceat(points[mine], first, axis=0) if len(first) else np.zeros((0, 3))
-    high = np.maximum.reduceat(points[mine], first, axis=0) if len(first) else np.zeros((0, 3))
-    box[at[held]] = np.concatenate([low, high], axis=1)[held]
-    return box

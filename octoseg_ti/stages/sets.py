@@ -203,12 +203,50 @@ def capped_rms(
     Returns:
         Shape (M,); 0 of an empty set.
     """
-    length = np.array([len(s) for s in sets], np.int64)[which]
+    owner, far = _distances(samples, sets, which, surfaces)
+    square = np.minimum(far**2, (_CAP * noise) ** 2)
+    length = np.bincount(owner, minlength=len(which))
+    return np.sqrt(np.bincount(owner, square, len(which)) / np.maximum(length, 1))
+
+
+def apart(
+    samples: Samples, sets: list[np.ndarray], which: np.ndarray, one: Surfaces, other: Surfaces
+) -> np.ndarray:
+    """Return how far two surfaces of every set are apart, at most, at its samples [mm].
+
+    Args:
+        samples: The samples.
+        sets: Sets of samples.
+        which: The set of every two surfaces, shape (M,).
+        one: The first of them.
+        other: The second ones.
+
+    Returns:
+        Shape (M,); 0 of an empty set.
+    """
+    owner, off_one = _distances(samples, sets, which, one)
+    _, off_other = _distances(samples, sets, which, other)
+    far = np.zeros((2, len(which)))
+    # Which side is outside does not matter.
+    np.maximum.at(far[0], owner, np.abs(off_one - off_other))
+    np.maximum.at(far[1], owner, np.abs(off_one + off_other))
+    return far.min(axis=0)
+
+
+def _distances(
+    samples: Samples, sets: list[np.ndarray], which: np.ndarray, surfaces: Surfaces
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the surface and the signed distance [mm] of every sample of the set of every surface.
+
+    Both shape (S,), set after set.
+    """
+    length = np.array([len(sets[w]) for w in which], np.int64)
     index = np.concatenate([np.zeros(0, np.int64), *(sets[w] for w in which)])
     owner = np.repeat(np.arange(len(which)), length)
-    far, _ = evaluate_surfaces(samples.point[index], owner, surfaces.kind, surfaces.parameters)
-    square = np.minimum(far**2, (_CAP * noise) ** 2)
-    return np.sqrt(np.bincount(owner, square, len(which)) / np.maximum(length, 1))
+    far, _ = evaluate_surfaces(
+        samples.point.take(index, axis=0), owner, surfaces.kind, surfaces.parameters
+    )
+    return owner, far
 
 
 def fit_sets(

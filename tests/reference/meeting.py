@@ -7,9 +7,11 @@ import numpy as np
 from reference.graph import components
 
 
-def contacts(own: list[list[int]], pairs: list[tuple[int, int]]) -> dict[tuple[int, int], int]:
-    """Return in how many leaves and pairs of leaves every two surfaces are both found."""
-    found: dict[tuple[int, int], int] = {}
+def contacts(
+    own: list[list[int]], pairs: list[tuple[int, int]]
+) -> dict[tuple[int, int], list[int]]:
+    """Return in which leaves, and first leaves of pairs, every two surfaces are both found."""
+    found: dict[tuple[int, int], list[int]] = {}
     for a, b in pairs + [(c, c) for c in range(len(own))]:
         if a != b and len(own[a]) == len(own[b]) == 1 and own[a] == own[b]:
             continue
@@ -17,7 +19,7 @@ def contacts(own: list[list[int]], pairs: list[tuple[int, int]]) -> dict[tuple[i
             for other in own[b]:
                 if one != other:
                     key = (min(one, other), max(one, other))
-                    found[key] = found.get(key, 0) + 1
+                    found.setdefault(key, []).append(a)
     return found
 
 

@@ -1,110 +1,17 @@
-"""Surfaces that meet, that are one, that others explain; and their connected pieces."""
+"""Surfaces that are one are merged; surfaces that others explain are given up."""
 
 import numpy as np
 import pytest
 from reference import meeting
-from reference.device_grid import samples_of, surface_leaves
-from reference.leaves import leaves_of
+from reference.device_grid import samples_of
 from reference.surfaces import CYLINDER, PLANE, patch_of
 
-from octoseg_ti.device import runtime
-from octoseg_ti.stages.labelling import label_lists, own_lists
-from octoseg_ti.stages.leaves import Leaves, members_of, sample_leaves
-from octoseg_ti.stages.merging import (
-    contacts,
-    cut_out,
-    entry_boxes,
-    explained_by_others,
-    merge_surfaces,
-    pieces,
-    smooth_contacts,
-)
+from octoseg_ti.stages.contacts import Contacts
+from octoseg_ti.stages.leaves import members_of
+from octoseg_ti.stages.merging import cut_out, explained_by_others, merge_surfaces
 from octoseg_ti.stages.sets import Surfaces
 
 NOISE = 0.02
-
-
-def random_own(leaves: Leaves, seed: int, count: int) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    leaf = rng.integers(0, len(leaves), 2 * len(leaves))
-    return own_lists(leaves, leaf, rng.integers(-1, count, len(leaf)))
-
-
-def as_lists(own: np.ndarray) -> list[list[int]]:
-    return [row[row >= 0].tolist() for row in own]
-
-
-def pairs_of(leaves: Leaves) -> list[tuple[int, int]]:
-    return list(zip(leaves.a.tolist(), leaves.b.tolist(), strict=True))
-
-
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("count", [1, 3, 40])
-def test_contacts_equal_the_reference(seed: int, count: int) -> None:
-    _, leaves = surface_leaves(seed, 900)
-    own = random_own(leaves, seed, count)
-    pairs, places = contacts(leaves, own)
-    expected = meeting.contacts(as_lists(own), pairs_of(leaves))
-    found = {(int(a), int(b)): int(n) for (a, b), n in zip(pairs, places, strict=True)}
-    assert found == expected
-    assert list(found) == sorted(found)
-
-
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("count", [1, 3, 40])
-def test_pieces_equal_the_reference(seed: int, count: int) -> None:
-    _, leaves = surface_leaves(seed, 900)
-    own = random_own(leaves, seed, count)
-    assert as_lists(pieces(leaves, own)) == meeting.pieces(as_lists(own), pairs_of(leaves))
-
-
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("gap", [0.02, 0.3, 1e3])
-def test_points_of_one_piece_are_no_farther_apart_than_the_gap(seed: int, gap: float) -> None:
-    grid, leaves = surface_leaves(seed, 900)
-    point = runtime.download(grid.point)
-    rng = np.random.default_rng(seed)
-    leaf = np.repeat(np.arange(len(leaves)), leaves.count)
-    label = rng.integers(-1, 2, len(leaves))[leaf]
-    label = np.where(rng.random(900) < 0.2, rng.integers(-1, 3, 900), label).astype(np.int32)
-    own = label_lists(leaves, label)
-    box = entry_boxes(point, leaves, own, label)
-    points = {
-        (c, s): point[(leaf == c) & (label == s)] for c, m in enumerate(as_lists(own)) for s in m
-    }
-    expected = np.array([[*p.min(axis=0), *p.max(axis=0)] for p in points.values()])
-    assert np.all(box[:, :3] <= expected[:, :3]) and np.all(box[:, 3:] >= expected[:, 3:])
-    several = np.array([np.ptp(label[leaf == c]) > 0 for c, _ in points])
-    np.testing.assert_array_equal(box[several], expected[several])
-    found = as_lists(pieces(leaves, own, box, gap))
-    assert found == meeting.pieces(as_lists(own), pairs_of(leaves), points, gap)
-
-
-def test_a_large_leaf_with_a_stray_point_links_nothing() -> None:
-    # Two faces of one plane, three apart, and between them one leaf of something else.
-    x, y = (a.ravel() for a in np.mgrid[0.05:9.0:0.1, 0.05:3.0:0.1])
-    leaves, order = leaves_of(np.column_stack([x, y, 0.0 * x]), 3.0)
-    points = np.column_stack([x, y, 0.0 * x])[order]
-    label = np.where((points[:, 0] < 3.0) | (points[:, 0] > 6.0), 0, 1).astype(np.int32)
-    label[np.flatnonzero(label == 1)[np.argmin(points[label == 1, 0])]] = 0
-    own = label_lists(leaves, label)
-    assert [row[row >= 0].tolist() for row in own] == [[0], [0, 1], [0]]
-    assert len(np.unique(pieces(leaves, own)[own == 0])) == 1
-    near = pieces(leaves, own, entry_boxes(points, leaves, own, label), 1.0)
-    assert len(np.unique(near[own == 0])) == 2
-
-
-def test_surfaces_that_meet_at_an_edge_are_no_smooth_contact() -> None:
-    grid, leaves = surface_leaves(0, 900)
-    own = own_lists(leaves, np.repeat(np.arange(len(leaves)), 3), np.tile([0, 1, 2], len(leaves)))
-    parameters = np.full((3, 8), np.nan)
-    parameters[:, :3] = 0.0
-    for s, angle in enumerate((0.0, 0.3, 1.2)):
-        parameters[s, 3:6] = 0.0, np.sin(angle), np.cos(angle)
-    surfaces = Surfaces(kind=np.zeros(3, np.int32), parameters=parameters)
-    smooth = smooth_contacts(leaves, own, sample_leaves(grid, leaves, 2), surfaces)
-    np.testing.assert_array_equal(smooth, [[0, 1]])
-    assert len(contacts(leaves, own)[0]) == 3
 
 
 def test_members_of_labels() -> None:
@@ -192,13 +99,27 @@ def test_halves_of_a_cylinder_are_merged_and_a_plane_is_not() -> None:
         kind=np.array([CYLINDER, CYLINDER, PLANE], np.int32),
         parameters=np.stack([parameters, parameters, level - [0, 0, 2.0, 0, 0, 0, 0, 0]]),
     )
-    pairs = np.array([[0, 1], [0, 2]])
-    name, merged = merge_surfaces(samples, label.astype(np.int32), surfaces, pairs, NOISE)
+    touching = Contacts(np.array([[0, 1], [0, 2]]), np.zeros(2), np.zeros(2))
+    name, merged = merge_surfaces(samples, label.astype(np.int32), surfaces, touching, NOISE)
     assert name[0] == name[1]
     assert name[2] == 2
     kept = int(name[0])
     assert merged.kind[kept] == CYLINDER
     np.testing.assert_allclose(merged.parameters[kept, 6], 6.0, atol=0.02)
+
+
+@pytest.mark.parametrize(("turn", "step", "one"), [(0.0, 0.0, 1), (0.2, 0.0, 2), (0.0, 0.5, 2)])
+def test_pieces_with_an_edge_or_a_step_between_them_are_not_merged(
+    turn: float, step: float, one: int
+) -> None:
+    rng = np.random.default_rng(0)
+    points, normals, parameters = patch_of(PLANE, rng, 400)
+    points += rng.normal(0.0, NOISE, (400, 3))
+    label = (np.arange(400) % 2).astype(np.int32)
+    surfaces = Surfaces(kind=np.full(2, PLANE, np.int32), parameters=np.tile(parameters, (2, 1)))
+    touching = Contacts(np.array([[0, 1]]), np.array([turn]), np.array([step]))
+    name, _ = merge_surfaces(samples_of(points, normals), label, surfaces, touching, NOISE)
+    assert len(set(name.tolist())) == one
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -6,7 +6,7 @@ from reference.device_grid import touching_leaves
 from reference.surfaces import CYLINDER, PLANE, SPHERE, TORUS, patch_of
 
 from octoseg_ti.stages.grid import build_grid
-from octoseg_ti.stages.scatter import surface_noise
+from octoseg_ti.stages.scatter import _neighborhoods, surface_noise
 
 
 def noise_of(
@@ -71,3 +71,30 @@ def test_the_order_of_the_points_does_not_matter() -> None:
 def test_too_few_points_have_none() -> None:
     points, normals, _ = patch_of(PLANE, np.random.default_rng(0), 10)
     assert noise_of(points, normals) is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("many", [40, 3000, 200_000])
+def test_neighbourhoods_equal_the_reference(seed: int, many: int) -> None:
+    """A window of points, of these one region's, of these the first, with the rest of a box."""
+    rng = np.random.default_rng(seed)
+    key = np.sort(rng.integers(0, many // 2, many))
+    region = np.append(0, rng.integers(-1, 3, many))[key // 10]
+    inside = np.flatnonzero(region >= 0)
+    expected: list[np.ndarray] = []
+    for first in np.unique(np.searchsorted(key, key[inside[np.arange(256) * len(inside) // 256]])):
+        last = np.searchsorted(key, key[min(first + 512, many - 1)])
+        mine = [i for i in range(first, last) if region[i] == region[first]]
+        mine = [i for i in mine if key[i] <= key[mine[min(127, len(mine) - 1)]]]
+        if region[first] >= 0 and len(mine) >= 24:
+            expected.append(np.array(mine))
+    index, begin = _neighborhoods(key, region)
+    np.testing.assert_array_equal(begin, np.cumsum([0, *(len(mine) for mine in expected)]))
+    np.testing.assert_array_equal(index, np.concatenate([np.zeros(0, np.int64), *expected]))
+    assert many < 1000 or len(expected) > 2
+
+
+def test_no_region_has_no_neighbourhoods() -> None:
+    index, begin = _neighborhoods(np.arange(100), np.full(100, -1))
+    assert len(index) == 0
+    assert begin.tolist() == [0]

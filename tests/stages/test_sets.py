@@ -8,6 +8,7 @@ from reference.surfaces import CONE, CYLINDER, PLANE, SPHERE, TORUS, distance_of
 
 from octoseg_ti.stages.sets import (
     Surfaces,
+    apart,
     fit_sets,
     joined,
     lie_on,
@@ -110,6 +111,31 @@ def test_what_no_surface_fits_has_none() -> None:
     fitted, surfaces = fit_sets(samples, [np.arange(200)], 0.01)
     assert len(fitted) == len(surfaces) == 0
     assert len(fit_sets(samples, [], 0.01)[0]) == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_how_far_surfaces_are_apart_equals_the_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(0.0, 5.0, (300, 3))
+    samples = samples_of(points, np.zeros((300, 3)))
+    parameters = np.stack([patch_of(k, rng, 1)[2] for k in KINDS])
+    one = Surfaces(kind=np.array(KINDS, np.int32), parameters=parameters)
+    moved = parameters.copy()
+    moved[:, :3] += 0.1 * rng.normal(size=(5, 3))
+    other = Surfaces(kind=one.kind, parameters=moved)
+    sets = [np.flatnonzero(rng.random(300) < share) for share in (0.3, 0.0, 0.5)]
+    which = np.array([2, 0, 1, 2, 0])
+    found = apart(samples, sets, which, one, other)
+    for k, w in enumerate(which):
+        far = [distance_of(points[sets[w]], int(KINDS[k]), p[k]) for p in (parameters, moved)]
+        expected = np.max(np.abs(far[0] - far[1]), initial=0.0)
+        np.testing.assert_allclose(found[k], expected, atol=1e-9)
+    turned = Surfaces(kind=one.kind[:1], parameters=moved[:1].copy())
+    turned.parameters[0, 3:6] *= -1.0  # the same plane, with its other side outside
+    back = apart(
+        samples, sets, which[:1], Surfaces(kind=one.kind[:1], parameters=moved[:1]), turned
+    )
+    np.testing.assert_allclose(back, 0.0, atol=1e-9)
 
 
 def test_members_are_spread_evenly() -> None:
