@@ -174,7 +174,7 @@ class _Search:
         if turn is not None:
             tolerance = tolerance._replace(turn=turn)
         # A line has no normals, and is no surface.
-        known = samples.normal.any(axis=1)
+        known: np.ndarray = np.any(samples.normal, axis=1)
         sets = [s for s in sets if 2 * np.count_nonzero(known[s]) > len(s)]
         new, label = explain(samples, self.leaves, sets, tolerance, apart=apart)
         for members in sets:
@@ -359,9 +359,8 @@ class _Search:
         off = runtime.download(self.labelling.choice.off)
         second = runtime.download(self.labelling.choice.second)
         # What faces another way explains nothing.
-        second = np.where(
-            off[:, 1] * self.labelling.rule.tilt <= self.labelling.rule.turn, second, NONE
-        )
+        most = self.labelling.rule.turn / self.labelling.rule.tilt
+        second = np.where(off[:, 1] <= most, second, NONE)
         gone = explained_by_others(self.label, second, off, len(self.surfaces), EXPLAINED)
         gone[len(gone) - len(self.sides) :] = False
         if not gone.any():

@@ -40,7 +40,8 @@ def refine(
     owner = np.repeat(np.arange(len(kind)), count)
     total = np.maximum(count, 1)
     centre = np.column_stack([np.bincount(owner, x, len(kind)) for x in points.T]) / total[:, None]
-    square = np.einsum("si,si->s", points - centre[owner], points - centre[owner])
+    away = points - np.repeat(centre, count, axis=0)
+    square = np.einsum("si,si->s", away, away)
     extent = np.sqrt(np.bincount(owner, square, len(kind)) / total)
     extent[extent == 0.0] = 1.0
     state = to_states(kind, parameters, centre, extent)

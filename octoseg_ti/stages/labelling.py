@@ -14,7 +14,7 @@ from octoseg_ti.device.linalg import angle_of, row, vec3
 from octoseg_ti.device.runtime import F32Rows, F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.surfaces import surface_in_row
 from octoseg_ti.stages.grid import Grid
-from octoseg_ti.stages.leaves import Leaves, distinct, ranges
+from octoseg_ti.stages.leaves import Leaves, distinct
 from octoseg_ti.types import NONE
 
 MOST = 12
@@ -80,11 +80,8 @@ def _gather(
     """
     for c in range(own_in.shape[0]):
         for k in range(MOST):
-            near_inout[c, k] = -1
+            near_inout[c, k] = ti.select(closed_in[c] == 0, own_in[c, k], -1)
         if closed_in[c] == 0:
-            for k in range(MOST):
-                if own_in[c, k] >= 0:
-                    _insert(near_inout, c, own_in[c, k])
             for e in range(start_in[c], start_in[c + 1]):
                 b = neighbor_in[e]
                 k = 0
@@ -99,6 +96,33 @@ def _gather(
             elif s >= 0 and changed_in[s] != 0:
                 stale = 1
         stale_out[c] = stale
+
+
+@ti.kernel
+def _list_labels(
+    # In:
+    label_in: I32Array,
+    leaf_in: I32Rows,
+    # Out:
+    own_inout: I32Rows,
+    common_out: I32Array,
+):
+    """List the labels of the points of every leaf; write the one that all have, -1 for others."""
+    for c in common_out:
+        for k in range(MOST):
+            own_inout[c, k] = -1
+        first = leaf_in[c, 0]
+        last = label_in[first]
+        common = last
+        if last >= 0:
+            own_inout[c, 0] = last
+        for i in range(first + 1, first + leaf_in[c, 1]):
+            if label_in[i] != last:
+                last = label_in[i]
+                common = -1
+                if last >= 0:
+                    _insert(own_inout, c, last)
+        common_out[c] = common
 
 
 @ti.kernel
@@ -188,12 +212,15 @@ def own_lists(leaves: Leaves, leaf: np.ndarray, label: np.ndarray) -> np.ndarray
 
 def common_label(leaves: Leaves, label: np.ndarray) -> np.ndarray:
     """Return the label that all points of a leaf have, -1 where they differ; shape (C,), i32."""
-    low = np.minimum.reduceat(label, leaves.first)
-    high = np.maximum.reduceat(label, leaves.first)
-    return np.where(low == high, low, NONE).astype(np.int32)
+    return leaf_labels(leaves, label)[1]
 
 
 def label_lists(leaves: Leaves, label: np.ndarray) -> np.ndarray:
+    """Return which labels the points of every leaf have, as `leaf_labels` does."""
+    return leaf_labels(leaves, label)[0]
+
+
+def leaf_labels(leaves: Leaves, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which labels the points of every leaf have.
 
     Args:
@@ -201,17 +228,16 @@ def label_lists(leaves: Leaves, label: np.ndarray) -> np.ndarray:
         label: Label of every sorted point, -1 = none, shape (n,), i32.
 
     Returns:
-        Labels of every leaf, ascending, then -1; shape (C, MOST), i32.
+        Labels of every leaf, ascending, then -1, shape (C, MOST), i32; and the label that all of
+        its points have, -1 where they differ, shape (C,), i32.
     """
-    one = common_label(leaves, label)
-    mixed = np.flatnonzero(one < 0)
-    count = leaves.count[mixed]
-    point = ranges(leaves.first[mixed], count)
-    return own_lists(
-        leaves,
-        np.concatenate([np.flatnonzero(one >= 0), np.repeat(mixed, count)]),
-        np.concatenate([one[one >= 0], label[point]]),
-    )
+    runtime.ensure_started()
+    count = len(leaves)
+    own, common = runtime.empty((count, MOST), np.int32), runtime.empty(count, np.int32)
+    if count:
+        ranges = np.stack([leaves.first, leaves.count], axis=1)
+        _list_labels(runtime.upload(label), runtime.upload(ranges), own, common)
+    return runtime.download(own)[:count], runtime.download(common)[:count]
 
 
 def near_lists(leaves: Leaves, own: np.ndarray) -> np.ndarray:

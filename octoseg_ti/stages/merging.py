@@ -126,7 +126,8 @@ def explained_by_others(
     Args:
         label: Surface of every point, -1 = none, shape (n,), i32.
         second: The surface that each point would choose next, -1 = none, shape (n,), i32.
-        off: Distance from that surface [noises], and angle to its normal [tilts], shape (n, 2).
+        off: Distance from that surface [noises], and angle to its normal [tilts], shape (n, 2) or
+            more.
         count: Number of surfaces M.
         limit: Largest mean square of these distances; one for all, or one each, shape (M,).
 
@@ -134,8 +135,9 @@ def explained_by_others(
         Which surfaces to give up, shape (M,), bool: the smallest first, and none that one given up
         leans on.
     """
-    here = np.flatnonzero((label >= 0) & (second >= 0))
-    mine, other, near = label[here], second[here], off[here]
+    # What is beyond the largest cap leans on nothing.
+    here = np.flatnonzero((off[:, 0] < 2.0 * _FORM) & (label >= 0) & (second >= 0))
+    mine, other, near = label[here], second[here], off.take(here, axis=0)
     size = np.bincount(label + 1, minlength=count + 1)[1:]
     alone = size - np.bincount(mine, minlength=count)
     far, deviation = mean_squares(mine, near[:, 0], (_CAP, 2.0 * _FORM), size, alone)

@@ -58,8 +58,10 @@ def explained_by_others(
 ) -> list[int]:
     """Return the surfaces whose points are within the limit of those they would choose next.
 
-    And errors of form: what is a little off one that is four times as large, smoothly.
+    And errors of form: what is a little off one that is four times as large, smoothly. Eight noises
+    away nothing explains a point.
     """
+    second = np.where(off[:, 0] < 8.0, second, -1)
     size = [int((label == m).sum()) for m in range(count)]
     gone: list[int] = []
     kept: set[int] = set()
