@@ -34,6 +34,8 @@ def find_blends(search: Search, zones: Zones, turn: np.ndarray) -> np.ndarray:
     joined = np.bincount(sides, np.tile(smooth & (zones.contact > 0), 2), search.count)
     border = np.bincount(sides, np.tile(zones.contact, 2), search.count)
     along = np.bincount(sides, np.tile(smooth * zones.contact, 2), search.count)
+    if not small.any():
+        return small
     there = np.flatnonzero(search.label >= 0)
     there = there[small[search.label[there]]]
     mean = [
@@ -58,6 +60,8 @@ def mark_blends(
         smooth: Which pairs join smoothly, shape (P,), bool.
         edge: `EdgeClass` of every point so far, shape (n,), u8.
     """
+    if not blend.any():
+        return
     mark = np.full(len(search.label), NONE, np.int32)
     mine = np.flatnonzero(search.label >= 0)
     mine = mine[blend[search.label[mine]]]

@@ -132,6 +132,8 @@ def give_back(
         radius: Its radius [mm], above 0 = concave, shape (F,).
     """
     label = search.label.copy()
+    if len(sides) == 0:
+        return label
     mine = np.flatnonzero(np.append(strip, NONE)[label] >= 0)
     mine = mine[search.analytic[label[mine]]]
     fillet = strip[label[mine]]
