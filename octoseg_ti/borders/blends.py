@@ -11,7 +11,7 @@ import numpy as np
 from octoseg_ti.borders.fillets import SLACK, WEAK, smooth_pairs, without_support
 from octoseg_ti.borders.zones import EDGE, Search, Zones, points_of
 from octoseg_ti.device.surfaces import evaluate_surfaces
-from octoseg_ti.stages.marking import nearest_marked
+from octoseg_ti.stages.marking import marked_near
 from octoseg_ti.types import NONE, EdgeClass
 
 # A blend joins at least so many others smoothly, along this share of its border.
@@ -85,8 +85,8 @@ def mark_blends(
         patch = zones.pairs[pair, column]
         kept = (search.label[point] != patch) & (edge[point] != int(EdgeClass.FILLET))
         point, patch = point[kept], patch[kept]
-        far = nearest_marked(
+        near = marked_near(
             search.device[0], mark, search.leaves, point, search.leaf_of(point), patch,
             np.full(len(point), EDGE * search.spacing),
         )  # fmt: skip
-        edge[point[np.isfinite(far)]] = int(EdgeClass.FILLET)
+        edge[point[near]] = int(EdgeClass.FILLET)

@@ -23,7 +23,7 @@ from octoseg_ti.borders.zones import (
     thinned,
 )
 from octoseg_ti.stages.leaves import Samples
-from octoseg_ti.stages.marking import nearest_marked
+from octoseg_ti.stages.marking import marked_near
 from octoseg_ti.stages.profiles import BALL
 from octoseg_ti.stages.sets import fit_sets, spread
 from octoseg_ti.types import NONE, SurfaceKind
@@ -311,8 +311,8 @@ def without_support(
     strong[weak] = NONE
     leaf = search.leaf_of(weak)
     reach = np.sqrt(2.0 * ON * search.noise * radius) + search.spacing
-    far = nearest_marked(search.device[0], strong, search.leaves, weak, leaf, mark[weak], reach)
-    return weak[~np.isfinite(far)]
+    near = marked_near(search.device[0], strong, search.leaves, weak, leaf, mark[weak], reach)
+    return weak[~near]
 
 
 def refit_sides(search: Search) -> None:

@@ -16,6 +16,9 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.device.surfaces import surface_at
+from octoseg_ti.types import EdgeClass
+
+SHARP, SMOOTH = int(EdgeClass.SHARP), int(EdgeClass.SMOOTH)
 
 BALL, FIRST, SECOND, NOWHERE = 0, 1, 2, 3
 """Where a point lies on a profile: between the lines of contact, beyond the first or the second
@@ -206,6 +209,65 @@ def _sum_up(
         sum_out[t, 3] = count
 
 
+@ti.func
+def _may_lie(edge_in: ti.template(), strip_in: ti.template(), m: ti.i32, label: ti.i32) -> ti.i32:
+    """Say whether a point with this label may lie on edge m: on a side; on a strip if it is round.
+
+    A round edge also takes points without a label.
+    """
+    found = ti.cast(label == edge_in[m, 0] or label == edge_in[m, 1], ti.i32)
+    if found == 0 and edge_in[m, 2] != SHARP and edge_in[m, 2] != SMOOTH:
+        found = ti.cast(label < 0, ti.i32)
+        for k in range(edge_in[m, 3], edge_in[m, 4]):
+            found |= ti.cast(strip_in[k] == label, ti.i32)
+    return found
+
+
+@ti.kernel
+def _reach_along(
+    limit: ti.types.vector(3, ti.f64),
+    # In:
+    point_in: F64Rows,
+    label_in: I32Array,
+    surface_in: F64Rows,
+    edge_in: I32Rows,
+    radius_in: F64Array,
+    strip_in: I32Array,
+    entry_in: I32Rows,
+    # Out:
+    along_out: F64Array,
+):
+    """Write how far points of leaves are from an edge along the surface; infinite: not beside it.
+
+    An edge lies on both surfaces: what is far from the other one is far from a sharp edge. A smooth
+    joint has no line: all points of its sides are beside it.
+    """
+    for e in range(entry_in.shape[0]):
+        m = entry_in[e, 0]
+        sharp = edge_in[m, 2] == SHARP
+        radius = ti.abs(radius_in[m])
+        hollow = ti.select(radius_in[m] < 0.0, -1.0, 1.0)
+        for k in range(entry_in[e, 2]):
+            i = entry_in[e, 1] + k
+            along = ti.math.inf
+            if _may_lie(edge_in, strip_in, m, label_in[i]) == 1:
+                far = 0.0
+                if sharp:
+                    other = ti.select(label_in[i] == edge_in[m, 0], edge_in[m, 1], edge_in[m, 0])
+                    far, _ = _side_at(surface_in, other, row(point_in, i))
+                if edge_in[m, 2] == SMOOTH:
+                    along = 0.0
+                elif ti.abs(far) <= limit[0]:
+                    f = place_on_profile(
+                        surface_in, edge_in[m, 0], edge_in[m, 1], row(point_in, i), radius, hollow
+                    )
+                    ball = ti.cast(f[2], ti.i32) == BALL
+                    fits = ti.abs(f[0]) <= ti.select(ball, limit[1], limit[2]) or (ball and sharp)
+                    if fits and f[1] <= limit[0]:
+                        along = f[1]
+            along_out[entry_in[e, 3] + k] = along
+
+
 def place(
     points: Any,
     normals: Any,
@@ -247,6 +309,67 @@ def place(
     turn = np.arccos(np.clip(found[:, 3], -1.0, 1.0))
     region = found[:, 2].astype(np.int32)
     return Places(found[:, 0], found[:, 1], region, turn, found[:, 4], found[:, 5])
+
+
+def points_beside(
+    points: Any,
+    label: np.ndarray,
+    surfaces: np.ndarray,
+    edges: np.ndarray,
+    strips: np.ndarray,
+    radius: np.ndarray,
+    edge: np.ndarray,
+    first: np.ndarray,
+    count: np.ndarray,
+    *,
+    reach: float,
+    on_ball: float,
+    on_side: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the points of ranges that are beside an edge.
+
+    Beside a smooth joint are all points of its sides; beside a sharp edge those on its profile;
+    beside a round one also those of its strips, and those without a label.
+
+    Args:
+        points: Positions [mm], shape (n, 3) (kernel array).
+        label: Surface of every point, -1 = none, shape (n,), i32.
+        surfaces: As for `place`.
+        edges: Both surfaces of every edge, its `EdgeClass`, and the range of its strips, (P, 5).
+        strips: Labels of points that lie on round edges, edge after edge.
+        radius: Signed radius of every edge [mm], above 0 = concave, shape (P,).
+        edge: Edge of every range, shape (E,).
+        first: First point of every range, shape (E,).
+        count: Its points, shape (E,).
+        reach: Largest distance along the surface [mm]; and from the other one, at sharp edges.
+        on_ball: Largest distance from the profile of a round edge between its lines [mm].
+        on_side: Largest distance from the profile on the sides [mm].
+
+    Returns:
+        The points, the range of each, and how far it is from the edge along the surface [mm], 0 at
+        smooth joints; range after range.
+    """
+    runtime.ensure_started()
+    if len(edge) == 0:
+        none = np.zeros(0, np.int64)
+        return none, none, np.zeros(0)
+    ends = np.cumsum(count, dtype=np.int64)
+    along = runtime.empty(int(ends[-1]), np.float64)
+    _reach_along(
+        (reach, on_ball, on_side),
+        points,
+        runtime.upload(label),
+        runtime.upload(surfaces),
+        runtime.upload(edges.astype(np.int32)),
+        runtime.upload(radius.astype(np.float64)),
+        runtime.upload(strips.astype(np.int32)),
+        runtime.upload(np.column_stack([edge, first, count, ends - count]).astype(np.int32)),
+        along,
+    )
+    far = runtime.download(along)[: ends[-1]]
+    beside = np.flatnonzero(far < np.inf)
+    which = np.searchsorted(ends, beside, side="right")
+    return beside + (first - (ends - count))[which], which, far[beside]
 
 
 def sums(
