@@ -76,7 +76,8 @@ def scan_lines(
         step = np.diff(lane)[run[1:] == run[:-1]]
         lane /= max(float(np.median(np.abs(step))) if len(step) else 1.0, 1e-12)
     rise = np.bincount(view, lane[last] - lane[first], views)
-    lane *= np.where(rise < 0.0, -1.0, 1.0)[view][run]
+    if (rise < 0.0).any():
+        lane *= np.where(rise < 0.0, -1.0, 1.0)[view][run]
     return Lines(point, start, run, view, lane, source, order)
 
 
@@ -111,11 +112,12 @@ def find_rims(
         around: The surroundings of points.
     """
     label, spacing = search.label, search.spacing
-    asked = (edge == int(EdgeClass.NONE)) & (label >= 0)
-    asked[asked] = search.analytic[label[asked]]
-    in_order, known = np.zeros(len(label), bool), np.zeros(len(label), bool)
-    in_order[lines.order], known[lines.order] = asked, edge != int(EdgeClass.NONE)
-    side = open_sides(lines, in_order, _GAP * spacing)[lines.order]
+    known = np.zeros(len(label), bool)
+    known[lines.order] = edge != int(EdgeClass.NONE)
+    asked = np.zeros(len(label), np.int32)
+    asked[lines.order] = np.append(search.analytic, False)[label]
+    asked[known] = 0
+    side = open_sides(lines, asked, _GAP * spacing)[lines.order]
     point = np.flatnonzero(side > 0)
     outward, free = around.free_sectors(
         search.device[1], point, search.leaf_of(point), _AROUND * spacing
@@ -164,8 +166,7 @@ def fields(lines: Lines, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def normals_of(search: Search, point: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Return the normals of the surfaces of some points, at other places, shape (E, 3)."""
     label = search.label[point]
-    kind, parameters = search.table[label, 8].astype(np.int32), search.table[label, :8]
-    _, normal = evaluate_surfaces(place, np.arange(len(point)), kind, parameters)
+    _, normal = evaluate_surfaces(place, label, search.table[:, 8], search.table[:, :8])
     outward: np.ndarray = np.nan_to_num(normal) * search.table[label, 9:]
     return outward
 

@@ -19,15 +19,13 @@ def _in_leaf(
 ) -> ti.i32:  # fmt: skip
     """Say whether leaf c has a point with the mark that is nearer to point i than the reach."""
     found = 0
-    held = leaf_in[c, 2] <= wanted and wanted <= leaf_in[c, 3]
-    if held and box_gap(box_in, c, row(point_in, i)) < square:
-        j = leaf_in[c, 0]
-        end = j + leaf_in[c, 1]
-        while j < end and found == 0:
-            if mark_in[j] == wanted and j != i:
-                near = (row(point_in, j) - row(point_in, i)).norm_sqr() < square
-                found = ti.cast(near, ti.i32)
-            j += 1
+    if leaf_in[c, 2] <= wanted and wanted <= leaf_in[c, 3]:
+        p = row(point_in, i)
+        if box_gap(box_in, c, p) < square:
+            for j in range(leaf_in[c, 0], leaf_in[c, 0] + leaf_in[c, 1]):
+                if mark_in[j] == wanted and (row(point_in, j) - p).norm_sqr() < square and j != i:
+                    found = 1
+                    break
     return found
 
 

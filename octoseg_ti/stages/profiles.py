@@ -31,6 +31,7 @@ _CLOSE, _FAR = (
 )  # a centre is found when so near its distances [mm]; it is none so far off
 _PARALLEL = 1e-6  # squared sine of the angle between surfaces below which they have no edge
 
+_SHARES = 32  # parts in which threads take tasks, however few these are
 _SHARP = 1e-9  # a smaller radius is none [mm]
 
 vec9 = ti.types.vector(9, ti.f64)
@@ -45,13 +46,18 @@ class Places(NamedTuple):
     """Distance from the nearer line of contact, along the surface [mm]; 0 between the lines of a
     round edge. Infinite where there is no edge near."""
     region: np.ndarray
-    """BALL, FIRST, SECOND or NOWHERE, i32."""
-    turn: np.ndarray
-    """Angle by which the surface turns from one side of the edge to the other [rad]."""
+    """BALL, FIRST, SECOND or NOWHERE."""
+    bend: np.ndarray
+    """Cosine of the turn."""
     cosine: np.ndarray
     """Cosine of the angle between the normals of the point and of the profile."""
     height: np.ndarray
     """Heights above both surfaces, added up [mm]: above 0 = a concave edge."""
+
+    @property
+    def turn(self) -> np.ndarray:
+        """Angle by which the surface turns from one side of the edge to the other [rad]."""
+        return np.arccos(np.clip(self.bend, -1.0, 1.0))
 
 
 @ti.func
@@ -165,14 +171,15 @@ def _place(
             surface_in, pair_in[m, 0], pair_in[m, 1], row(point_in, entry_in[e, 0]), radius, hollow
         )
         for k in ti.static(range(4)):
-            place_out[e, k] = f[k]
-        place_out[e, 4] = vec3(f[5], f[6], f[7]).dot(row(normal_in, entry_in[e, 0]))
-        place_out[e, 5] = f[8]
+            place_out[k, e] = f[k]
+        place_out[4, e] = vec3(f[5], f[6], f[7]).dot(row(normal_in, entry_in[e, 0]))
+        place_out[5, e] = f[8]
 
 
 @ti.kernel
 def _sum_up(
     tasks: ti.i32,
+    stride: ti.i32,
     cap: ti.f64,
     # In:
     point_in: F64Rows,
@@ -184,29 +191,31 @@ def _sum_up(
     sum_out: F64Rows,
 ):
     """Sum capped squares, gradient, curvature and points on the ball over the points of a task."""
-    for t in range(tasks):
-        cost = 0.0
-        gradient = 0.0
-        curvature = 0.0
-        count = 0.0
-        for j in range(task_in[t, 2], task_in[t, 3]):
-            f = place_on_profile(
-                surface_in, task_in[t, 0], task_in[t, 1], row(point_in, entry_in[j]),
-                shape_in[t, 0], shape_in[t, 1],
-            )  # fmt: skip
-            off = f[0]
-            if ti.abs(off) < cap:
-                cost += off * off
-                if ti.cast(f[2], ti.i32) == BALL:
-                    gradient += off * f[4]
-                    curvature += f[4] * f[4]
-                    count += 1.0
-            else:
-                cost += cap * cap
-        sum_out[t, 0] = cost
-        sum_out[t, 1] = gradient
-        sum_out[t, 2] = curvature
-        sum_out[t, 3] = count
+    for u in range(tasks * stride):
+        if u % stride == 0:
+            t = u // stride
+            cost = 0.0
+            gradient = 0.0
+            curvature = 0.0
+            count = 0.0
+            for j in range(task_in[t, 2], task_in[t, 3]):
+                f = place_on_profile(
+                    surface_in, task_in[t, 0], task_in[t, 1], row(point_in, entry_in[j]),
+                    shape_in[t, 0], shape_in[t, 1],
+                )  # fmt: skip
+                off = f[0]
+                if ti.abs(off) < cap:
+                    cost += off * off
+                    if ti.cast(f[2], ti.i32) == BALL:
+                        gradient += off * f[4]
+                        curvature += f[4] * f[4]
+                        count += 1.0
+                else:
+                    cost += cap * cap
+            sum_out[t, 0] = cost
+            sum_out[t, 1] = gradient
+            sum_out[t, 2] = curvature
+            sum_out[t, 3] = count
 
 
 @ti.func
@@ -292,9 +301,10 @@ def place(
     runtime.ensure_started()
     entries = len(point)
     if entries == 0:
-        none = np.zeros(0)
-        return Places(none, none, np.zeros(0, np.int32), none, none, none)
-    out = runtime.empty((entries, 6), np.float64)
+        return Places(*np.zeros((6, 0)))
+    out = runtime.empty((6, entries), np.float64)
+    entry = np.empty((entries, 2), np.int32)
+    entry[:, 0], entry[:, 1] = point, edge
     _place(
         entries,
         points,
@@ -302,13 +312,10 @@ def place(
         runtime.upload(surfaces),
         runtime.upload(pairs.astype(np.int32)),
         runtime.upload(radius.astype(np.float64)),
-        runtime.upload(np.column_stack([point, edge]).astype(np.int32)),
+        runtime.upload(entry),
         out,
     )
-    found = runtime.download(out)
-    turn = np.arccos(np.clip(found[:, 3], -1.0, 1.0))
-    region = found[:, 2].astype(np.int32)
-    return Places(found[:, 0], found[:, 1], region, turn, found[:, 4], found[:, 5])
+    return Places(*runtime.download(out))
 
 
 def points_beside(
@@ -400,6 +407,7 @@ def sums(
     out = runtime.empty((len(task), 4), np.float64)
     _sum_up(
         len(task),
+        max(_SHARES * runtime.workers()[1] // len(task), 1),
         cap,
         points,
         runtime.upload(surfaces),
