@@ -135,25 +135,20 @@ def look_around(search: Search, zones: Zones) -> Around:
 
 def guess_radii(search: Search, zones: Zones, around: Around) -> tuple[np.ndarray, np.ndarray]:
     """Return about which radius every edge has, and whether it may have one, (P,) f64 and bool."""
+    radii = search.radii(_RATIO)
     point, start = around.thinned(_FEW)
-    least = 0.5 * search.spacing
-    radii = np.concatenate([[0.0], search.radii(_RATIO)])
     task = tasks(zones.pairs, start)
-    cost, _ = search.tried(task, radii, around.hollow, point)
-    radius = np.maximum(radii[cost.argmin(axis=1)], least)
-    unit = (search.coarse() / search.noise) ** 2
-    total = task[:, 3] - task[:, 2]
-    hope = (cost[:, 0] - cost.min(axis=1)) * unit > np.maximum(_HOPE * total, 1.0)
+    radius, gain = search.best(task, radii, around.hollow, point)
+    total = np.diff(start)
+    hope = gain > np.maximum(_HOPE * total, 1.0)
     # What the noise of few points hides may show among more.
     unsure = ~hope & (total >= FEWEST) & ~smooth_pairs(search, zones.pairs, around.turn)
     again = np.flatnonzero(unsure)
     point, start = around.thinned(_SOME)
-    cost, _ = search.tried(
-        tasks(zones.pairs, start)[again], radii[::_SKIP], around.hollow[again], point
-    )
-    hope[again] = (cost[:, 0] - cost.min(axis=1)) * unit > _SURE
-    radius[again] = np.maximum(radii[::_SKIP][cost.argmin(axis=1)], least)
-    return radius, hope
+    task, some = tasks(zones.pairs, start)[again], radii[_SKIP - 1 :: _SKIP]
+    radius[again], gain = search.best(task, some, around.hollow[again], point)
+    hope[again] = gain > _SURE
+    return np.maximum(radius, 0.5 * search.spacing), hope
 
 
 def fit_balls(
@@ -175,7 +170,7 @@ def fit_balls(
         )  # fmt: skip
     point, start = around.thinned(_SOME)
     task = tasks(zones.pairs, start)
-    shape = np.column_stack([radius, around.hollow])[hope]
+    shape = np.stack([radius, around.hollow], axis=1)[hope]
     cap = CAP * noise
     # From the tolerance that radii were tried with down to that of the noise: where this is small
     # no point lies within it of a ball whose radius is only about right.
@@ -183,13 +178,13 @@ def fit_balls(
     for turn, wide in enumerate(tolerances):
         if last and turn == len(tolerances) - 1:
             point, task = around.point, tasks(zones.pairs, around.start)
-        now = search.sums(task[hope], shape, point, wide)
+        now = search.sums(task[hope], shape[:, None], point, wide)[:, 0]
         step = -now[:, 1] / np.maximum(now[:, 2], 1e-12)
         least = 0.2 * shape[:, 0]
         shape[:, 0] = np.clip(shape[:, 0] + np.clip(step, -least, least), 0.02, 2.0 * search.limit)
     now, none = np.zeros((pairs, 4)), np.zeros((pairs, 4))
-    now[hope] = search.sums(task[hope], shape, point, cap)
-    none[hope] = search.sums(task[hope], shape * [0.0, 1.0], point, cap)
+    both = np.stack([shape, shape * [0.0, 1.0]], axis=1)
+    now[hope], none[hope] = search.sums(task[hope], both, point, cap).swapaxes(0, 1)
     radius[hope] = shape[:, 0]
     total = np.maximum(task[:, 3] - task[:, 2], 1)
     gain = (none[:, 0] - now[:, 0]) / noise**2

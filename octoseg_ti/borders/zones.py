@@ -173,10 +173,15 @@ class Search:
         return place(device, device, self.table, pairs, radius, point, pair).along <= reach
 
     def sums(
-        self, task: np.ndarray, shape: np.ndarray, entry: np.ndarray, cap: float
+        self,
+        task: np.ndarray,
+        shape: np.ndarray,
+        entry: np.ndarray,
+        cap: float,
+        limit: np.ndarray | None = None,
     ) -> np.ndarray:
         """Sum up how profiles fit."""
-        return sums(self.device[0], self.table, task, shape, entry, cap)
+        return sums(self.device[0], self.table, task, shape, entry, cap, limit)
 
     def reach(self, turn: np.ndarray) -> np.ndarray:
         """Return how far from the sharp edge a fillet can reach [mm]."""
@@ -214,10 +219,23 @@ class Search:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the cost of every radius for every task, and the points on its ball."""
         cap = self.coarse()
-        shape = np.column_stack([np.tile(radii, len(task)), np.repeat(hollow, len(radii))])
-        got = self.sums(np.repeat(task, len(radii), axis=0), shape, point, cap)
-        got = got.reshape(len(task), len(radii), 4)
+        shape = np.stack(np.broadcast_arrays(radii, hollow[:, None]), axis=2)
+        got = self.sums(task, shape, point, cap)
         return got[..., 0] / cap**2, got[..., 3]
+
+    def best(
+        self, task: np.ndarray, radii: np.ndarray, hollow: np.ndarray, point: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the radius of least cost for every task, and by how much that is below no radius.
+
+        The gain is in squares of the noise; where that is 0 or less the radius may be any.
+        """
+        cap = self.coarse()
+        shape = np.stack(np.broadcast_arrays(radii, hollow[:, None]), axis=2)
+        sharp = self.sums(task, shape[:, :1] * [0.0, 1.0], point, cap)[:, 0, 0]
+        cost = self.sums(task, shape, point, cap, sharp)[..., 0]
+        gain = (sharp - cost.min(axis=1)) / cap**2 * (cap / self.noise) ** 2
+        return radii[cost.argmin(axis=1)], gain
 
 
 def listed(sets: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, ti
-from octoseg_ti.device.surfaces import surface_at
+from octoseg_ti.device.surfaces import surface_at, vec4
 from octoseg_ti.types import EdgeClass
 
 SHARP, SMOOTH = int(EdgeClass.SHARP), int(EdgeClass.SMOOTH)
@@ -61,20 +61,22 @@ class Places(NamedTuple):
 
 
 @ti.func
-def _side_at(surface_in: ti.template(), s: ti.i32, p: vec3):
-    """Return (height of a point above a surface, its normal there), on the side of the air."""
+def _side_at(surface_in: ti.template(), s: ti.i32, p: vec3) -> vec4:
+    """Return (normal of a surface at a point (3), height of that), on the side of the air."""
     axis = vec3(surface_in[s, 3], surface_in[s, 4], surface_in[s, 5])
     d, n = surface_at(
         ti.cast(surface_in[s, 8], ti.i32), p, row(surface_in, s), axis, surface_in[s, 6],
         surface_in[s, 7],
     )  # fmt: skip
     side = surface_in[s, 9]
-    return side * d, side * n
+    return vec4(side * n[0], side * n[1], side * n[2], side * d)
 
 
 @ti.func
-def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, radius: ti.f64,
-                     hollow: ti.f64) -> vec9:  # fmt: skip
+def _place_on_profile(
+    surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, side_a: vec4, side_b: vec4,
+    radius: ti.f64, hollow: ti.f64,
+) -> vec9:  # fmt: skip
     """Return (off, along, region, cosine of the turn, change of off, normal (3), height).
 
     The change is that with the radius; the height is the sum of the heights above both surfaces.
@@ -86,13 +88,17 @@ def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, r
         a: The first surface.
         b: The second one.
         p: The point.
+        side_a: What `_side_at` says of the first surface there.
+        side_b: What it says of the second one.
         radius: Radius of the ball [mm], 0 or more.
         hollow: 1 for a concave edge, -1 for a convex one.
     """
     c = p
     signed = hollow * radius
-    ca, ma = _side_at(surface_in, a, p)
-    cb, mb = _side_at(surface_in, b, p)
+    ca = side_a[3]
+    cb = side_b[3]
+    ma = vec3(side_a[0], side_a[1], side_a[2])
+    mb = vec3(side_b[0], side_b[1], side_b[2])
     da = ca
     db = cb
     step = 0
@@ -104,8 +110,12 @@ def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, r
             x = signed - ca
             y = signed - cb
             c += ((x - g * y) / det) * ma + ((y - g * x) / det) * mb
-            ca, ma = _side_at(surface_in, a, c)
-            cb, mb = _side_at(surface_in, b, c)
+            at_a = _side_at(surface_in, a, c)
+            at_b = _side_at(surface_in, b, c)
+            ca = at_a[3]
+            cb = at_b[3]
+            ma = vec3(at_a[0], at_a[1], at_a[2])
+            mb = vec3(at_b[0], at_b[1], at_b[2])
         else:
             step = _STEPS
     off = da
@@ -118,8 +128,8 @@ def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, r
         u = p - c
         x = -hollow * u.dot(ma)
         y = -hollow * u.dot(mb)
-        toward_a = (x - g * y) / det
-        toward_b = (y - g * x) / det
+        toward_a = x - g * y
+        toward_b = y - g * x
         size = u.norm()
         change = 0.0
         region = BALL
@@ -147,6 +157,16 @@ def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, r
             off, along, ti.cast(region, ti.f64), g, change, normal[0], normal[1], normal[2], da + db
         )
     return result
+
+
+@ti.func
+def place_on_profile(
+    surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, radius: ti.f64, hollow: ti.f64
+) -> vec9:
+    """Return what `_place_on_profile` does of a point about which nothing is known yet."""
+    side_a = _side_at(surface_in, a, p)
+    side_b = _side_at(surface_in, b, p)
+    return _place_on_profile(surface_in, a, b, p, side_a, side_b, radius, hollow)
 
 
 @ti.kernel
@@ -178,7 +198,6 @@ def _place(
 
 @ti.kernel
 def _sum_up(
-    tasks: ti.i32,
     stride: ti.i32,
     cap: ti.f64,
     # In:
@@ -186,36 +205,40 @@ def _sum_up(
     surface_in: F64Rows,
     task_in: I32Rows,
     shape_in: F64Rows,
+    limit_in: F64Array,
     entry_in: I32Array,
     # Out:
-    sum_out: F64Rows,
+    sum_inout: F64Rows,
 ):
-    """Sum capped squares, gradient, curvature and points on the ball over the points of a task."""
-    for u in range(tasks * stride):
+    """Sum capped squares, gradient, curvature and points on the ball over the points of a task.
+
+    All shapes of a task, as many for each, share what is known of a point. What costs more than the
+    limit of the task is not added up any further.
+    """
+    shapes = shape_in.shape[0] // task_in.shape[0]
+    for u in range(task_in.shape[0] * stride):
         if u % stride == 0:
             t = u // stride
-            cost = 0.0
-            gradient = 0.0
-            curvature = 0.0
-            count = 0.0
+            a = task_in[t, 0]
+            b = task_in[t, 1]
             for j in range(task_in[t, 2], task_in[t, 3]):
-                f = place_on_profile(
-                    surface_in, task_in[t, 0], task_in[t, 1], row(point_in, entry_in[j]),
-                    shape_in[t, 0], shape_in[t, 1],
-                )  # fmt: skip
-                off = f[0]
-                if ti.abs(off) < cap:
-                    cost += off * off
-                    if ti.cast(f[2], ti.i32) == BALL:
-                        gradient += off * f[4]
-                        curvature += f[4] * f[4]
-                        count += 1.0
-                else:
-                    cost += cap * cap
-            sum_out[t, 0] = cost
-            sum_out[t, 1] = gradient
-            sum_out[t, 2] = curvature
-            sum_out[t, 3] = count
+                p = row(point_in, entry_in[j])
+                side_a = _side_at(surface_in, a, p)
+                side_b = _side_at(surface_in, b, p)
+                for k in range(t * shapes, (t + 1) * shapes):
+                    if sum_inout[k, 0] <= limit_in[t]:
+                        f = _place_on_profile(
+                            surface_in, a, b, p, side_a, side_b, shape_in[k, 0], shape_in[k, 1]
+                        )
+                        off = f[0]
+                        if ti.abs(off) < cap:
+                            sum_inout[k, 0] += off * off
+                            if ti.cast(f[2], ti.i32) == BALL:
+                                sum_inout[k, 1] += off * f[4]
+                                sum_inout[k, 2] += f[4] * f[4]
+                                sum_inout[k, 3] += 1.0
+                        else:
+                            sum_inout[k, 0] += cap * cap
 
 
 @ti.func
@@ -263,7 +286,7 @@ def _reach_along(
                 far = 0.0
                 if sharp:
                     other = ti.select(label_in[i] == edge_in[m, 0], edge_in[m, 1], edge_in[m, 0])
-                    far, _ = _side_at(surface_in, other, row(point_in, i))
+                    far = _side_at(surface_in, other, row(point_in, i))[3]
                 if edge_in[m, 2] == SMOOTH:
                     along = 0.0
                 elif ti.abs(far) <= limit[0]:
@@ -386,6 +409,7 @@ def sums(
     shape: np.ndarray,
     entry: np.ndarray,
     cap: float,
+    limit: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return how well profiles fit.
 
@@ -393,27 +417,28 @@ def sums(
         points: Positions [mm], shape (n, 3) (kernel array).
         surfaces: As for `place`.
         task: First surface, second surface, first and last entry of every task, shape (T, 4).
-        shape: Radius [mm] and 1 for concave, -1 for convex, shape (T, 2).
+        shape: Radius [mm] and 1 for concave, -1 for convex of every profile, shape (T, R, 2).
         entry: Points, listed for tasks, shape (E,).
         cap: Distances beyond this count as this [mm].
+        limit: Where a sum of squares is above that of its task [mm^2], shape (T,), sums may leave
+            out points; None = none does.
 
     Returns:
-        Shape (T, 4): sum of the squares of distances [mm^2], half its gradient and curvature with
-        respect to the radius, and the points between the lines of contact.
+        Shape (T, R, 4): sum of the squares of distances [mm^2], half its gradient and curvature
+        with respect to the radius, and the points between the lines of contact.
     """
     runtime.ensure_started()
-    if len(task) == 0:
-        return np.zeros((0, 4))
-    out = runtime.empty((len(task), 4), np.float64)
-    _sum_up(
-        len(task),
-        max(_SHARES * runtime.workers()[1] // len(task), 1),
-        cap,
-        points,
-        runtime.upload(surfaces),
-        runtime.upload(task.astype(np.int32)),
-        runtime.upload(shape.astype(np.float64)),
-        runtime.upload(entry.astype(np.int32)),
-        out,
-    )
-    return runtime.download(out)
+    total = runtime.zeros((shape.shape[0] * shape.shape[1], 4), np.float64)
+    if len(task):
+        _sum_up(
+            max(_SHARES * runtime.workers()[1] // len(task), 1),
+            cap,
+            points,
+            runtime.upload(surfaces),
+            runtime.upload(task.astype(np.int32)),
+            runtime.upload(shape.reshape(-1, 2).astype(np.float64)),
+            runtime.upload(np.full(len(task), np.inf) if limit is None else limit),
+            runtime.upload(entry.astype(np.int32)),
+            total,
+        )
+    return runtime.download(total)[: shape.shape[0] * shape.shape[1]].reshape(*shape.shape[:2], 4)

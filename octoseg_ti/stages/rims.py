@@ -124,11 +124,12 @@ def _open_sides(
             down_end = down
             if s > 0 and view_in[ti.max(s - 1, 0)] == view_in[s]:
                 down_end = start_in[s]
+            ahead = 0
             for i in range(start_in[s], start_in[s + 1]):
                 side = 0
+                back = ahead
+                ahead = _close(point_in, i, ti.select(i + 1 < start_in[s + 1], i + 1, -1), gap)
                 if asked_in[i] == 1:
-                    ahead = _close(point_in, i, ti.select(i + 1 < start_in[s + 1], i + 1, -1), gap)
-                    back = _close(point_in, i, ti.select(i > start_in[s], i - 1, -1), gap)
                     if ahead != back:
                         side += ti.select(back == 1, NEXT, BEFORE)
                     next_near = 0
