@@ -102,7 +102,7 @@ def find_borders(search: Search, lines: Lines | None = None) -> Borders:
     return Borders(
         label=give_back(search, strip, sides, fit.radius[fillets]),
         edge=edge,
-        fillet=number[search.claim],
+        fillet=np.take(number, search.claim),
         sides=sides,
         radius=fit.radius[fillets],
         deviation=fit.deviation[fillets],

@@ -147,10 +147,9 @@ class Search:
     def set_sides(self) -> None:
         """Say for every surface on which side the air is."""
         index, owner = listed([spread(m, _SIDE) for m in self.members])
-        _, outward = evaluate_surfaces(
-            self.points[index], owner, self.table[:, 8].astype(np.int32), self.table[:, :8]
-        )
-        cosine = np.nan_to_num(np.einsum("ij,ij->i", outward, self.normals[index]))
+        points, normals = np.take(self.points, index, axis=0), np.take(self.normals, index, axis=0)
+        _, outward = evaluate_surfaces(points, owner, self.table[:, 8], self.table[:, :8])
+        cosine = np.nan_to_num(np.einsum("ij,ij->i", outward, normals))
         self.table[:, 9] = np.where(np.bincount(owner, cosine, self.count) < 0.0, -1.0, 1.0)
 
     def place(
@@ -219,8 +218,7 @@ class Search:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the cost of every radius for every task, and the points on its ball."""
         cap = self.coarse()
-        shape = np.stack(np.broadcast_arrays(radii, hollow[:, None]), axis=2)
-        got = self.sums(task, shape, point, cap)
+        got = self.sums(task, _shapes(radii, hollow), point, cap)
         return got[..., 0] / cap**2, got[..., 3]
 
     def best(
@@ -231,11 +229,15 @@ class Search:
         The gain is in squares of the noise; where that is 0 or less the radius may be any.
         """
         cap = self.coarse()
-        shape = np.stack(np.broadcast_arrays(radii, hollow[:, None]), axis=2)
-        sharp = self.sums(task, shape[:, :1] * [0.0, 1.0], point, cap)[:, 0, 0]
-        cost = self.sums(task, shape, point, cap, sharp)[..., 0]
+        sharp = self.sums(task, _shapes(np.zeros(1), hollow), point, cap)[:, 0, 0]
+        cost = self.sums(task, _shapes(radii, hollow), point, cap, sharp)[..., 0]
         gain = (sharp - cost.min(axis=1)) / cap**2 * (cap / self.noise) ** 2
         return radii[cost.argmin(axis=1)], gain
+
+
+def _shapes(radii: np.ndarray, hollow: np.ndarray) -> np.ndarray:
+    """Return all radii for every task, each with the sign of that, as `profiles.sums` takes it."""
+    return np.stack(np.broadcast_arrays(radii, hollow[:, None]), axis=2)
 
 
 def listed(sets: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
