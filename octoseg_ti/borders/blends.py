@@ -28,14 +28,14 @@ def find_blends(search: Search, zones: Zones, turn: np.ndarray) -> np.ndarray:
         zones: The pairs of patches.
         turn: Mean angle by which the surface turns over the edge of every pair [rad], shape (P,).
     """
-    small = search.ball_radii() <= SLACK * search.limit
+    small: np.ndarray = search.ball_radii() <= SLACK * search.limit
+    if not small.any():
+        return small
     smooth = smooth_pairs(search, zones.pairs, turn)
     sides = zones.pairs.T.ravel()
     joined = np.bincount(sides, np.tile(smooth & (zones.contact > 0), 2), search.count)
     border = np.bincount(sides, np.tile(zones.contact, 2), search.count)
     along = np.bincount(sides, np.tile(smooth * zones.contact, 2), search.count)
-    if not small.any():
-        return small
     there = np.flatnonzero(search.label >= 0)
     there = there[small[search.label[there]]]
     mean = [

@@ -90,6 +90,8 @@ def find_corners(search: Search, zones: Zones, fit: Fit, chosen: np.ndarray) -> 
 def fillets_that_meet(pairs: np.ndarray, fit: Fit, chosen: np.ndarray) -> np.ndarray:
     """Return the pairs of fillets that share one side and may be of one ball, shape (M, 2)."""
     fillets = np.flatnonzero(chosen)
+    if len(fillets) < 2:
+        return np.zeros((0, 2), np.int64)
     i, j = (fillets[k] for k in np.triu_indices(len(fillets), 1))
     shared = (pairs[i][:, :, None] == pairs[j][:, None, :]).sum(axis=(1, 2)) == 1
     i, j = i[shared], j[shared]

@@ -108,9 +108,9 @@ def leaves_beside(
     pair, leaf = np.divmod(key, len(leaves))
     kept = ~idle[pair]
     pair, leaf = pair[kept], leaf[kept]
-    low, high = leaves.box[:, :3], leaves.box[:, 3:]
-    wide = EDGE * search.spacing + 0.5 * np.linalg.norm(high - low, axis=1)
-    kept = search.near_edge(zones.pairs, radius, 0.5 * (low + high), leaf, pair, wide[leaf])
+    middle, wide = search.balls
+    reach = EDGE * search.spacing + wide[leaf]
+    kept = search.near_edge(zones.pairs, radius, middle, leaf, pair, reach)
     kept |= form[pair] == SMOOTH
     return pair[kept], leaf[kept]
 

@@ -139,6 +139,12 @@ class Search:
         off = self.off[self.label >= 0]
         return float(np.sqrt(np.mean(off**2))) if len(off) else self.noise
 
+    @cached_property
+    def balls(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centre and radius of a ball around the points of every leaf, shape (C, 3) and (C,)."""
+        low, high = self.leaves.box[:, :3], self.leaves.box[:, 3:]
+        return 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
+
     def leaf_of(self, point: np.ndarray) -> np.ndarray:
         """Return the leaves that hold some points, shape (E,)."""
         leaf: np.ndarray = np.searchsorted(self.leaves.first, point, side="right") - 1
@@ -228,6 +234,8 @@ class Search:
 
         The gain is in squares of the noise; where that is 0 or less the radius may be any.
         """
+        if len(task) == 0 or len(radii) == 0:
+            return np.zeros(len(task)), np.zeros(len(task))
         cap = self.coarse()
         sharp = self.sums(task, _shapes(np.zeros(1), hollow), point, cap)[:, 0, 0]
         cost = self.sums(task, _shapes(radii, hollow), point, cap, sharp)[..., 0]
@@ -382,11 +390,10 @@ def leaves_between(search: Search, triple: np.ndarray) -> tuple[np.ndarray, np.n
     cell, first = cell[order], np.searchsorted(name[order], np.arange(search.count + 1))
     each = (first[1:] - first[:-1])[triple[:, 0]]
     leaf, owner = cell[ranges(first[triple[:, 0]], each)], np.repeat(np.arange(len(triple)), each)
-    low, high = search.leaves.box[:, :3], search.leaves.box[:, 3:]
-    wide = 0.5 * np.linalg.norm(high - low, axis=1)
+    middle, wide = search.balls
     # How far fillets reach at most: the nearer ones are picked where points are placed.
     near = search.near_edge(
-        triple[:, 1:], np.zeros(len(triple)), 0.5 * (low + high), leaf, owner,
+        triple[:, 1:], np.zeros(len(triple)), middle, leaf, owner,
         search.reach(np.full(1, np.pi)) + wide[leaf],
     )  # fmt: skip
     return owner[near], leaf[near]
