@@ -115,7 +115,7 @@ def _along(rows: np.ndarray, to: np.ndarray) -> np.ndarray:
 def _mode(outward: np.ndarray) -> np.ndarray:
     """Return the direction that most of the directions are near."""
     some = outward[:: max(len(outward) // 50, 1)]
-    support = [np.count_nonzero(_along(outward, to) >= _ALIKE) for to in some]
+    support = np.count_nonzero(np.einsum("ij,kj->ki", outward, some) >= _ALIKE, axis=1)
     mode = some[int(np.argmax(support))]
     for _ in range(_ROUNDS):
         mode = outward[_along(outward, mode) >= _ALIKE].mean(axis=0)

@@ -11,7 +11,7 @@ import numpy as np
 from octoseg_ti.borders.fillets import SLACK, WEAK, smooth_pairs, without_support
 from octoseg_ti.borders.zones import EDGE, Search, Zones, points_of
 from octoseg_ti.device.surfaces import evaluate_surfaces
-from octoseg_ti.stages.marking import nearest_marked
+from octoseg_ti.stages.marking import marked_near
 from octoseg_ti.types import NONE, EdgeClass
 
 # A blend joins at least so many others smoothly, along this share of its border.
@@ -28,7 +28,9 @@ def find_blends(search: Search, zones: Zones, turn: np.ndarray) -> np.ndarray:
         zones: The pairs of patches.
         turn: Mean angle by which the surface turns over the edge of every pair [rad], shape (P,).
     """
-    small = search.ball_radii() <= SLACK * search.limit
+    small: np.ndarray = search.ball_radii() <= SLACK * search.limit
+    if not small.any():
+        return small
     smooth = smooth_pairs(search, zones.pairs, turn)
     sides = zones.pairs.T.ravel()
     joined = np.bincount(sides, np.tile(smooth & (zones.contact > 0), 2), search.count)
@@ -58,6 +60,8 @@ def mark_blends(
         smooth: Which pairs join smoothly, shape (P,), bool.
         edge: `EdgeClass` of every point so far, shape (n,), u8.
     """
+    if not blend.any():
+        return
     mark = np.full(len(search.label), NONE, np.int32)
     mine = np.flatnonzero(search.label >= 0)
     mine = mine[blend[search.label[mine]]]
@@ -81,8 +85,8 @@ def mark_blends(
         patch = zones.pairs[pair, column]
         kept = (search.label[point] != patch) & (edge[point] != int(EdgeClass.FILLET))
         point, patch = point[kept], patch[kept]
-        far = nearest_marked(
+        near = marked_near(
             search.device[0], mark, search.leaves, point, search.leaf_of(point), patch,
             np.full(len(point), EDGE * search.spacing),
         )  # fmt: skip
-        edge[point[np.isfinite(far)]] = int(EdgeClass.FILLET)
+        edge[point[near]] = int(EdgeClass.FILLET)

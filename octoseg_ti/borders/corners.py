@@ -70,6 +70,12 @@ def find_corners(search: Search, zones: Zones, fit: Fit, chosen: np.ndarray) -> 
         chosen: Which pairs are fillets, shape (P,), bool.
     """
     meeting = fillets_that_meet(zones.pairs, fit, chosen)
+    if len(meeting) == 0:
+        none = np.zeros(0, np.int64)
+        return Corners(
+            np.zeros((0, 3), np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3, 3)), none,
+            none,
+        )  # fmt: skip
     sides = np.sort(zones.pairs[meeting].reshape(-1, 4), axis=1)
     # Of four names one is there twice.
     twice = np.argmax(sides[:, 1:] == sides[:, :-1], axis=1)[:, None]
@@ -84,6 +90,8 @@ def find_corners(search: Search, zones: Zones, fit: Fit, chosen: np.ndarray) -> 
 def fillets_that_meet(pairs: np.ndarray, fit: Fit, chosen: np.ndarray) -> np.ndarray:
     """Return the pairs of fillets that share one side and may be of one ball, shape (M, 2)."""
     fillets = np.flatnonzero(chosen)
+    if len(fillets) < 2:
+        return np.zeros((0, 2), np.int64)
     i, j = (fillets[k] for k in np.triu_indices(len(fillets), 1))
     shared = (pairs[i][:, :, None] == pairs[j][:, None, :]).sum(axis=(1, 2)) == 1
     i, j = i[shared], j[shared]
@@ -132,10 +140,12 @@ def _touching(search: Search, start: np.ndarray, sides: np.ndarray, radius: np.n
             centre[steep] += np.linalg.solve(normal[steep], high[steep, :, None])[..., 0]
     good = np.flatnonzero(steep & (np.abs(high).max(axis=1, initial=0.0) < _CLOSE))
     kept: list[int] = []
-    for k in good:
-        same = [j for j in kept if (sides[j] == sides[k]).all() and radius[j] * radius[k] > 0.0]
+    alike: dict[tuple[int, ...], list[int]] = {}
+    for k in good.tolist():
+        same = alike.setdefault((*sides[k].tolist(), int(radius[k] > 0.0)), [])
         if all(np.linalg.norm(centre[j] - centre[k]) > abs(radius[k]) for j in same):
-            kept.append(int(k))
+            same.append(k)
+            kept.append(k)
     toward = -np.sign(radius[kept])[:, None, None] * normal[kept]
     return Corners(sides[kept], centre[kept], radius[kept], toward, none, none)
 
@@ -207,6 +217,10 @@ def parts_of(search: Search, zones: Zones, corners: Corners, strip_of: np.ndarra
         strip_of: Sides of the fillet that every patch is a strip of, -1 = none, shape (K, 2).
     """
     count = search.count
+    if len(corners.sides) == 0:
+        return Parts(
+            np.zeros(count, bool), np.zeros((0, 3), np.int64), np.zeros(len(zones.pairs), bool)
+        )
     strips = [np.zeros((0, 3), np.int64)]
     on = np.zeros(len(search.label), bool)
     on[corners.point] = True

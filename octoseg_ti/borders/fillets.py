@@ -11,10 +11,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from octoseg_ti.borders.zones import CAP, TURN, Search, Zones, listed, points_of, tasks, thinned
+from octoseg_ti.borders.zones import (
+    CAP,
+    TURN,
+    Search,
+    Zones,
+    listed,
+    points_of,
+    starts_of,
+    tasks,
+    thinned,
+)
 from octoseg_ti.stages.leaves import Samples
-from octoseg_ti.stages.marking import nearest_marked
-from octoseg_ti.stages.profiles import BALL, NOWHERE
+from octoseg_ti.stages.marking import marked_near
+from octoseg_ti.stages.profiles import BALL
 from octoseg_ti.stages.sets import fit_sets, spread
 from octoseg_ti.types import NONE, SurfaceKind
 
@@ -84,8 +94,8 @@ class Around(NamedTuple):
 
     point: np.ndarray
     """Some of the points, evenly, shape (E,)."""
-    pair: np.ndarray
-    """The pair of each."""
+    start: np.ndarray
+    """First entry of every pair, and E at the end, shape (P + 1,)."""
     every: np.ndarray
     """About how many points there are, shape (P,)."""
     hollow: np.ndarray
@@ -94,54 +104,51 @@ class Around(NamedTuple):
     """Mean angle by which the surface turns over the edge [rad]."""
 
     def thinned(self, most: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return at most about so many points for every pair, and the pair of each."""
-        kept = thinned(self.pair, len(self.every), most)
-        return self.point[kept], self.pair[kept]
+        """Return at most about so many points for every pair, and the first of each pair."""
+        kept, start = thinned(self.start, most)
+        return self.point[kept], start
 
 
 def look_around(search: Search, zones: Zones) -> Around:
     """Return the points around the edge of every pair."""
     pairs = len(zones.pairs)
     point, pair = points_of(search, zones, np.ones(pairs, bool))
-    whole = np.bincount(pair, minlength=pairs)
-    kept = thinned(pair, pairs, _MANY)
+    whole = starts_of(pair, pairs)
+    kept, start = thinned(whole, _MANY)
     point, pair = point[kept], pair[kept]
-    share = np.bincount(pair, minlength=pairs) / np.maximum(whole, 1)
+    share = np.diff(start) / np.maximum(np.diff(whole), 1)
     at = search.place(zones.pairs, np.zeros(pairs), point, pair)
-    kept = (at.region != NOWHERE) & (at.along <= search.reach(at.turn))
-    point, pair = point[kept], pair[kept]
-    total = np.bincount(pair, minlength=pairs)
-    height = np.bincount(pair, np.sign(at.height[kept]), pairs)
+    turn = at.turn
+    near = np.flatnonzero(at.along <= search.reach(turn))
+    point, pair = point[near], pair[near]
+    start = starts_of(pair, pairs)
+    total = np.diff(start)
+    height = np.bincount(pair, np.sign(at.height[near]), pairs)
     return Around(
         point=point,
-        pair=pair,
+        start=start,
         every=total / np.maximum(share, 1e-9),
         hollow=np.where(height < 0.0, -1.0, 1.0),
-        turn=np.bincount(pair, at.turn[kept], pairs) / np.maximum(total, 1),
+        turn=np.bincount(pair, turn[near], pairs) / np.maximum(total, 1),
     )
 
 
 def guess_radii(search: Search, zones: Zones, around: Around) -> tuple[np.ndarray, np.ndarray]:
     """Return about which radius every edge has, and whether it may have one, (P,) f64 and bool."""
-    point, pair = around.thinned(_FEW)
-    least = 0.5 * search.spacing
-    radii = np.concatenate([[0.0], search.radii(_RATIO)])
-    task = tasks(zones.pairs, pair)
-    cost, _ = search.tried(task, radii, around.hollow, point)
-    radius = np.maximum(radii[cost.argmin(axis=1)], least)
-    unit = (search.coarse() / search.noise) ** 2
-    total = task[:, 3] - task[:, 2]
-    hope = (cost[:, 0] - cost.min(axis=1)) * unit > np.maximum(_HOPE * total, 1.0)
+    radii = search.radii(_RATIO)
+    point, start = around.thinned(_FEW)
+    task = tasks(zones.pairs, start)
+    radius, gain = search.best(task, radii, around.hollow, point)
+    total = np.diff(start)
+    hope = gain > np.maximum(_HOPE * total, 1.0)
     # What the noise of few points hides may show among more.
     unsure = ~hope & (total >= FEWEST) & ~smooth_pairs(search, zones.pairs, around.turn)
     again = np.flatnonzero(unsure)
-    point, pair = around.thinned(_SOME)
-    cost, _ = search.tried(
-        tasks(zones.pairs, pair)[again], radii[::_SKIP], around.hollow[again], point
-    )
-    hope[again] = (cost[:, 0] - cost.min(axis=1)) * unit > _SURE
-    radius[again] = np.maximum(radii[::_SKIP][cost.argmin(axis=1)], least)
-    return radius, hope
+    point, start = around.thinned(_SOME)
+    task, some = tasks(zones.pairs, start)[again], radii[_SKIP - 1 :: _SKIP]
+    radius[again], gain = search.best(task, some, around.hollow[again], point)
+    hope[again] = gain > _SURE
+    return np.maximum(radius, 0.5 * search.spacing), hope
 
 
 def fit_balls(
@@ -155,24 +162,29 @@ def fit_balls(
     """Fit a ball to the points around the edge of every pair; to more of them at ``last``."""
     pairs, noise = len(zones.pairs), search.noise
     radius, hope = guess[0].copy(), guess[1]
-    point, pair = around.thinned(_SOME)
-    task = tasks(zones.pairs, pair)
-    shape = np.column_stack([radius, around.hollow])[hope]
+    if not hope.any():
+        none = np.zeros(pairs)
+        return Fit(
+            radius=radius * around.hollow, deviation=none, hollow=around.hollow, turn=around.turn,
+            points=np.diff(around.start), good=none > 0.0, large=none > 0.0,
+        )  # fmt: skip
+    point, start = around.thinned(_SOME)
+    task = tasks(zones.pairs, start)
+    shape = np.stack([radius, around.hollow], axis=1)[hope]
     cap = CAP * noise
     # From the tolerance that radii were tried with down to that of the noise: where this is small
     # no point lies within it of a ball whose radius is only about right.
     tolerances = np.append(np.geomspace(search.coarse(), cap, _NEWTON - 2), cap)
     for turn, wide in enumerate(tolerances):
         if last and turn == len(tolerances) - 1:
-            point, pair = around.point, around.pair
-            task = tasks(zones.pairs, pair)
-        now = search.sums(task[hope], shape, point, wide)
+            point, task = around.point, tasks(zones.pairs, around.start)
+        now = search.sums(task[hope], shape[:, None], point, wide)[:, 0]
         step = -now[:, 1] / np.maximum(now[:, 2], 1e-12)
         least = 0.2 * shape[:, 0]
         shape[:, 0] = np.clip(shape[:, 0] + np.clip(step, -least, least), 0.02, 2.0 * search.limit)
     now, none = np.zeros((pairs, 4)), np.zeros((pairs, 4))
-    now[hope] = search.sums(task[hope], shape, point, cap)
-    none[hope] = search.sums(task[hope], shape * [0.0, 1.0], point, cap)
+    both = np.stack([shape, shape * [0.0, 1.0]], axis=1)
+    now[hope], none[hope] = search.sums(task[hope], both, point, cap).swapaxes(0, 1)
     radius[hope] = shape[:, 0]
     total = np.maximum(task[:, 3] - task[:, 2], 1)
     gain = (none[:, 0] - now[:, 0]) / noise**2
@@ -193,7 +205,7 @@ def fit_balls(
         deviation=_SHARED * np.maximum(rms, 0.3 * noise) / np.sqrt(np.maximum(now[:, 2], 1e-12)),
         hollow=around.hollow,
         turn=around.turn,
-        points=task[:, 3] - task[:, 2],
+        points=np.diff(around.start),
         good=rounded & small,
         large=rounded & ~small & (rms <= _ALIKE * search.usual),
     )
@@ -201,6 +213,9 @@ def fit_balls(
 
 def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
     """Let balls claim the points on them, the best supported first; say which remain, (P,) bool."""
+    search.claim[:] = NONE
+    if not fit.good.any():
+        return fit.good
     point, pair = points_of(search, zones, fit.good)
     at = search.place(zones.pairs, fit.radius, point, pair)
     on = (at.region == BALL) & (np.abs(at.off) <= ON * search.noise)
@@ -213,7 +228,7 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
     number = np.bincount(of)
     ball, own = np.bincount(of, at.off[on] ** 2), np.bincount(of, search.off[point] ** 2)
     better = ball <= WORSE**2 * own + (EVEN * search.noise) ** 2 * number
-    side = (search.label[point][:, None] == zones.pairs[pair]).any(axis=1)
+    side = zones.holds(pair, search.label[point])
     kept = better[of] | side
     pairs = len(zones.pairs)
     spared, wrong = kept & ~side, ~kept
@@ -221,12 +236,11 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
         np.bincount(pair, spared, pairs), FOREIGN * np.bincount(pair, side, pairs)
     )
     point, pair = point[kept], pair[kept]
-    ends = np.searchsorted(pair, np.arange(pairs + 1))
+    ends = starts_of(pair, pairs)
     support = np.diff(ends)
     # A ball that explains its points as well as surfaces do theirs goes before one that does not.
     square = np.bincount(pair, at.off[on][kept] ** 2, pairs) / np.maximum(support, 1)
     quality = np.clip(2.0 - square / max(search.usual**2, 1e-12), 0.1, 1.0)
-    search.claim[:] = NONE
     chosen, taken = np.zeros(pairs, bool), np.zeros(search.count, np.int64)
     for p in np.argsort(-support * quality, kind="stable"):
         if support[p] < FEWEST or not agree[p]:
@@ -242,33 +256,39 @@ def claim_points(search: Search, zones: Zones, fit: Fit) -> np.ndarray:
         search.claim[fresh] = p
         taken += np.bincount(search.label[fresh] + 1, minlength=search.count + 1)[1:]
         chosen[p] = True
-    had = claims_of(search, pairs)
-    drop_weak_claims(search, zones, fit)
+    claimed = np.flatnonzero(search.claim >= 0)
+    had = np.bincount(search.claim[claimed], minlength=pairs)
+    claimed = drop_weak_claims(search, zones, fit, claimed)
+    left = np.bincount(search.claim[claimed], minlength=pairs)
     # Of a fillet that is none nothing is left but what the noise moved off the sides.
-    lost = claims_of(search, pairs) < np.maximum(_FRESH * had, FEWEST)
-    search.claim[np.append(lost, False)[search.claim]] = NONE
+    lost = left < np.maximum(_FRESH * had, FEWEST)
+    search.claim[claimed[lost[search.claim[claimed]]]] = NONE
     return chosen & ~lost
 
 
-def claims_of(search: Search, pairs: int) -> np.ndarray:
-    """Return how many points every pair has claimed, shape (pairs,)."""
-    return np.bincount(search.claim + 1, minlength=pairs + 1)[1:]
-
-
-def drop_weak_claims(search: Search, zones: Zones, fit: Fit) -> None:
+def drop_weak_claims(search: Search, zones: Zones, fit: Fit, claimed: np.ndarray) -> np.ndarray:
     """Give back points that lie on a side of the fillet as well, unless others are next to them.
 
     Near the line of contact the ball is as good as the surface; beyond the end of a fillet both go
     on, and there nothing else lies on the ball.
+
+    Args:
+        search: What is known.
+        zones: The pairs of patches.
+        fit: The balls of all pairs.
+        claimed: Points that are claimed, ascending, shape (E,).
+
+    Returns:
+        Those of them that stay claimed.
     """
-    mine = np.flatnonzero(search.claim >= 0)
-    pair = search.claim[mine]
-    side = (search.label[mine][:, None] == zones.pairs[pair]).any(axis=1)
+    pair = search.claim[claimed]
+    side = zones.holds(pair, search.label[claimed])
     # Where no point of the ball is far from the sides that tells nothing.
     deep = np.abs(fit.radius) * (1.0 - np.cos(fit.turn / 2.0)) >= (WEAK + 1.0) * search.noise
-    weak = side & deep[pair] & (search.off[mine] <= WEAK * search.noise)
+    weak = side & deep[pair] & (search.off[claimed] <= WEAK * search.noise)
     radius = np.abs(fit.radius[pair[weak]])
-    search.claim[without_support(search, search.claim, mine[weak], radius)] = NONE
+    search.claim[without_support(search, search.claim, claimed[weak], radius)] = NONE
+    return claimed[search.claim[claimed] >= 0]
 
 
 def without_support(
@@ -286,15 +306,14 @@ def without_support(
     strong[weak] = NONE
     leaf = search.leaf_of(weak)
     reach = np.sqrt(2.0 * ON * search.noise * radius) + search.spacing
-    far = nearest_marked(search.device[0], strong, search.leaves, weak, leaf, mark[weak], reach)
-    return weak[~np.isfinite(far)]
+    near = marked_near(search.device[0], strong, search.leaves, weak, leaf, mark[weak], reach)
+    return weak[~near]
 
 
 def refit_sides(search: Search) -> None:
     """Fit the surfaces of patches anew without the points that fillets claim."""
-    claimed = np.bincount(
-        search.label[(search.claim >= 0) & (search.label >= 0)], minlength=search.count
-    )
+    label = search.label[search.claim >= 0]
+    claimed = np.bincount(label[label >= 0], minlength=search.count)
     left = search.size - claimed
     again = np.flatnonzero(
         search.analytic
@@ -320,10 +339,13 @@ def refit_sides(search: Search) -> None:
 
 def strips_of(search: Search, number: np.ndarray) -> np.ndarray:
     """Return the fillet that every patch is a strip of, -1 = none, shape (K,), i32."""
-    there = (search.claim >= 0) & (search.label >= 0)
     fillets = int(number.max(initial=NONE)) + 1
-    key = search.label[there].astype(np.int64) * max(fillets, 1) + number[search.claim[there]]
-    table = np.bincount(key, minlength=search.count * max(fillets, 1)).reshape(search.count, -1)
+    if fillets == 0:
+        return np.full(search.count, NONE, np.int32)
+    there = np.flatnonzero(search.claim >= 0)
+    there = there[search.label[there] >= 0]
+    key = search.label[there].astype(np.int64) * fillets + number[search.claim[there]]
+    table = np.bincount(key, minlength=search.count * fillets).reshape(search.count, -1)
     most = table.sum(axis=1) >= np.maximum(_STRIP_SHARE * search.size, 1)
     return np.where(most, table.argmax(axis=1), NONE).astype(np.int32)
 

@@ -76,7 +76,8 @@ def scan_lines(
         step = np.diff(lane)[run[1:] == run[:-1]]
         lane /= max(float(np.median(np.abs(step))) if len(step) else 1.0, 1e-12)
     rise = np.bincount(view, lane[last] - lane[first], views)
-    lane *= np.where(rise < 0.0, -1.0, 1.0)[view][run]
+    if (rise < 0.0).any():
+        lane *= np.where(rise < 0.0, -1.0, 1.0)[view][run]
     return Lines(point, start, run, view, lane, source, order)
 
 
@@ -84,10 +85,9 @@ def mark_rims(search: Search, lines: Lines, edge: np.ndarray) -> None:
     """Mark the points at rims as sharp, in place, where they are at no other edge."""
     label, spacing = search.label, search.spacing
     around = Surroundings(search.device[0], search.leaves, _AROUND * spacing)
-    point, outward = find_rims(search, lines, edge, around)
+    point, normal, outward = find_rims(search, lines, edge, around)
     leaf = search.leaf_of(point)
     place = search.points[point]
-    normal = normals_of(search, point, place)
     base = find_base(place, normal, outward, label[point], search.leaves.box, spacing, search.noise)
     stands = np.zeros(len(point), bool)
     if base is not None:
@@ -101,8 +101,8 @@ def mark_rims(search: Search, lines: Lines, edge: np.ndarray) -> None:
 
 def find_rims(
     search: Search, lines: Lines, edge: np.ndarray, around: Surroundings
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last points of faces at rims, and the directions in which the faces end there.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the last points of faces at rims, their normals, and where the faces end there.
 
     Args:
         search: What is known.
@@ -111,28 +111,30 @@ def find_rims(
         around: The surroundings of points.
     """
     label, spacing = search.label, search.spacing
-    asked = (edge == int(EdgeClass.NONE)) & (label >= 0)
-    asked[asked] = search.analytic[label[asked]]
-    in_order, known = np.zeros(len(label), bool), np.zeros(len(label), bool)
-    in_order[lines.order], known[lines.order] = asked, edge != int(EdgeClass.NONE)
-    side = open_sides(lines, in_order, _GAP * spacing)[lines.order]
+    # Points at no edge yet: 2 on an analytic surface, 1 elsewhere.
+    state = np.append(np.where(search.analytic, 2, 1), 1).astype(np.uint8)[label]
+    state[edge != int(EdgeClass.NONE)] = 0
+    in_order = np.empty_like(state)
+    in_order[lines.order] = state
+    side = open_sides(lines, in_order == 2, _GAP * spacing)[lines.order]
     point = np.flatnonzero(side > 0)
     outward, free = around.free_sectors(
         search.device[1], point, search.leaf_of(point), _AROUND * spacing
     )
     there = np.flatnonzero((free >= FREE) & (free < SECTORS))
     point, outward = point[there], outward[there]
-    field, cut = fields(lines, known)
+    field, cut = fields(lines, in_order == 0)
+    normal = normals_of(search, point, search.points[point])
     place = lines.order[point]
     found = look_beyond(
-        lines, field, place, side[point], normals_of(search, point, search.points[point]), outward,
+        lines, field, place, side[point], normal, outward,
         gap=_GAP * spacing, off=_OFF * spacing + CAP * search.noise,
     )  # fmt: skip
     real = (found & (ENDED | BEHIND)) > 0
     real |= ((found & PASSED) > 0) & ~cut[lines.view[lines.run[place]]]
     real &= (found & HIDDEN) == 0
-    real[real] = ends_straight(search, point[real], outward[real], _GAP * spacing)
-    return point[real], outward[real]
+    real[real] = ends_straight(search, point[real], normal[real], outward[real], _GAP * spacing)
+    return point[real], normal[real], outward[real]
 
 
 def fields(lines: Lines, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -164,22 +166,22 @@ def fields(lines: Lines, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def normals_of(search: Search, point: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Return the normals of the surfaces of some points, at other places, shape (E, 3)."""
     label = search.label[point]
-    kind, parameters = search.table[label, 8].astype(np.int32), search.table[label, :8]
-    _, normal = evaluate_surfaces(place, np.arange(len(point)), kind, parameters)
+    _, normal = evaluate_surfaces(place, label, search.table[:, 8], search.table[:, :8])
     outward: np.ndarray = np.nan_to_num(normal) * search.table[label, 9:]
     return outward
 
 
-def ends_straight(search: Search, point: np.ndarray, outward: np.ndarray, way: float) -> np.ndarray:
+def ends_straight(
+    search: Search, point: np.ndarray, normal: np.ndarray, outward: np.ndarray, way: float
+) -> np.ndarray:
     """Say which faces would go on without turning away from the probe, (E,) bool.
 
     A face that does may end because the probe sees it too flat from the side.
     """
     at = search.points[point]
-    here = normals_of(search, point, at)
     turn = [
-        np.linalg.norm(normals_of(search, point, at + way * to) - here, axis=1)
-        for to in (outward, np.cross(outward, here))
+        np.linalg.norm(normals_of(search, point, at + way * to) - normal, axis=1)
+        for to in (outward, np.cross(outward, normal))
     ]
     straight: np.ndarray = turn[0] <= _STRAIGHT * turn[1] + 1e-9
     return straight

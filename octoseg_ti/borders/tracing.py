@@ -18,31 +18,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from octoseg_ti.borders.blends import find_blends, mark_blends
 from octoseg_ti.borders.corners import find_corners, mark_corners, parts_of
 from octoseg_ti.borders.fillets import (
-    ON,
     WEAK,
-    Fit,
     claim_points,
     fit_balls,
     guess_radii,
     look_around,
     numbers_of,
     refit_sides,
-    smooth_pairs,
     strip_pairs,
     strips_of,
 )
+from octoseg_ti.borders.marks import mark_points
 from octoseg_ti.borders.rims import mark_rims
-from octoseg_ti.borders.zones import CAP, EDGE, Search, Zones, find_zones
-from octoseg_ti.device import runtime
-from octoseg_ti.device.surfaces import distances_to_surfaces, evaluate_surfaces
-from octoseg_ti.stages.leaves import distinct, ranges
-from octoseg_ti.stages.marking import nearest_marked
+from octoseg_ti.borders.zones import Search, find_zones
+from octoseg_ti.device.surfaces import evaluate_surfaces
 from octoseg_ti.stages.profiles import BALL, FIRST, SECOND
 from octoseg_ti.stages.rims import Lines
-from octoseg_ti.types import NONE, EdgeClass
+from octoseg_ti.types import NONE
 
 _GIVEN = 0.15  # share of the points of a strip that its sides may get back, at most
 
@@ -108,7 +102,7 @@ def find_borders(search: Search, lines: Lines | None = None) -> Borders:
     return Borders(
         label=give_back(search, strip, sides, fit.radius[fillets]),
         edge=edge,
-        fillet=number[search.claim],
+        fillet=np.take(number, search.claim),
         sides=sides,
         radius=fit.radius[fillets],
         deviation=fit.deviation[fillets],
@@ -132,6 +126,8 @@ def give_back(
         radius: Its radius [mm], above 0 = concave, shape (F,).
     """
     label = search.label.copy()
+    if len(sides) == 0:
+        return label
     mine = np.flatnonzero(np.append(strip, NONE)[label] >= 0)
     mine = mine[search.analytic[label[mine]]]
     fillet = strip[label[mine]]
@@ -157,100 +153,3 @@ def give_back(
     weak = least < reach[own]
     label[mine[weak]] = sides[fillet[weak], nearer[weak]]
     return label
-
-
-def mark_points(
-    search: Search,
-    zones: Zones,
-    fit: Fit,
-    chosen: np.ndarray,
-    strip: np.ndarray,
-    joined: np.ndarray,
-) -> np.ndarray:
-    """Return the `EdgeClass` of every point: that of the nearest edge within two spacings.
-
-    Args:
-        search: What is known.
-        zones: The pairs of patches.
-        fit: The balls of all pairs.
-        chosen: Which pairs are fillets, shape (P,), bool.
-        strip: Fillet that every patch is a strip of, -1 = none, shape (K,).
-        joined: Which pairs are known to join smoothly, shape (P,), bool.
-    """
-    leaves, reach = search.leaves, EDGE * search.spacing
-    radius = np.where(chosen, fit.radius, 1e-12 * fit.hollow)
-    smooth = smooth_pairs(search, zones.pairs, fit.turn) | fit.large | (fit.points < 5) | joined
-    smooth &= ~chosen
-    idle = ~chosen & (strip[zones.pairs] >= 0).any(axis=1) & smooth
-    # The leaves of the zones, and those that touch them.
-    more = ~smooth[zones.pair]
-    near_pair, near_leaf = zones.pair[more].astype(np.int64), zones.leaf[more]
-    around = np.diff(leaves.start)[near_leaf]
-    beside = leaves.neighbor[ranges(leaves.start[near_leaf], around)]
-    key = np.concatenate(
-        [
-            zones.pair.astype(np.int64) * len(leaves) + zones.leaf,
-            np.repeat(near_pair, around) * len(leaves) + beside,
-        ]
-    )
-    key = distinct(key)
-    pair, leaf = key // len(leaves), key % len(leaves)
-    pair, leaf = pair[~idle[pair]], leaf[~idle[pair]]
-    box = leaves.box
-    wide = 0.5 * np.linalg.norm(box[:, 3:] - box[:, :3], axis=1)
-    kept = search.near_edge(
-        zones.pairs, radius, 0.5 * (box[:, :3] + box[:, 3:]), leaf, pair, reach + wide[leaf]
-    )
-    kept |= smooth[pair]
-    pair, leaf = pair[kept], leaf[kept]
-    count = leaves.count[leaf]
-    point = ranges(leaves.first[leaf], count)
-    pair, leaf = np.repeat(pair, count), np.repeat(leaf, count)
-    label = search.label[point]
-    first, second = zones.pairs[pair, 0], zones.pairs[pair, 1]
-    ours = (label == first) | (label == second)
-    # An edge lies on both surfaces: what is far from the other one is far from the edge.
-    sharp = np.flatnonzero(ours & ~(smooth | chosen)[pair])
-    other = np.where(label == first, second, first)
-    kind, parameters = search.table[:, 8].astype(np.int32), search.table[:, :8]
-    off = distances_to_surfaces(
-        runtime.upload(search.points[point[sharp]]), other[sharp], kind, parameters
-    )
-    ours[sharp] = np.abs(off) <= reach
-    ours |= chosen[pair] & zones.allows(pair, label)
-    point, pair, leaf, label, other = (a[ours] for a in (point, pair, leaf, label, other))
-    # A smooth joint has no line.
-    near, along = smooth[pair], np.zeros(len(point))
-    lined = np.flatnonzero(~near)
-    at = search.place(zones.pairs, radius, point[lined], pair[lined])
-    ball = at.region == BALL
-    fits = np.abs(at.off) <= np.where(ball, ON, CAP) * search.noise
-    fits |= ball & ~chosen[pair[lined]]
-    near[lined], along[lined] = (at.along <= reach) & fits, at.along
-    point, pair, leaf, other, along = (a[near] for a in (point, pair, leaf, other, along))
-    found = np.ones(len(point), bool)
-    far = np.where(smooth[pair], reach - 0.5 * search.spacing, along + reach)
-    # A small leaf that holds the other label needs no search.
-    held = np.zeros(len(point), bool)
-    for own in search.own.T:
-        held |= own[leaf] == other
-    held &= 2.0 * wide[leaf] <= far
-    for k, marks, wanted in (
-        (np.flatnonzero(~chosen[pair] & ~held), search.label, other),
-        (np.flatnonzero(chosen[pair]), search.claim, pair),
-    ):
-        distance = nearest_marked(
-            search.device[0], marks, leaves, point[k], leaf[k], wanted[k], far[k]
-        )
-        found[k] = np.isfinite(distance)
-    point, pair, along = point[found], pair[found], along[found]
-    code = np.full(len(zones.pairs), int(EdgeClass.SHARP), np.uint8)
-    code[smooth], code[chosen] = int(EdgeClass.SMOOTH), int(EdgeClass.FILLET)
-    # What is nearer to another edge than to a smooth joint belongs to that.
-    order = np.argsort(-np.where(smooth[pair], reach, along), kind="stable")
-    edge = np.zeros(len(search.points), np.uint8)
-    edge[point[order]] = code[pair[order]]
-    blend = find_blends(search, zones, fit.turn) & (strip < 0)
-    mark_blends(search, zones, blend, smooth, edge)
-    edge[search.claim >= 0] = int(EdgeClass.FILLET)
-    return edge

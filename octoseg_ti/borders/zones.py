@@ -6,6 +6,7 @@ edge is the leaves where both patches are near, and those of its strips.
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from octoseg_ti.device.surfaces import distances_to_surfaces, evaluate_surfaces
 from octoseg_ti.stages.extraction import Surfaces
 from octoseg_ti.stages.labelling import label_lists, near_lists
 from octoseg_ti.stages.leaves import Leaves, distinct, members_of, ranges
-from octoseg_ti.stages.profiles import BALL, NOWHERE, Places, place, sums
+from octoseg_ti.stages.profiles import BALL, Places, place, sums
 from octoseg_ti.stages.sets import spread
 from octoseg_ti.types import NONE, SurfaceKind
 
@@ -48,18 +49,26 @@ class Zones(NamedTuple):
     """Leaf of every entry, shape (E,)."""
     fine: np.ndarray
     """Whether the leaf is small, shape (E,), bool: the others are next to the edge, or far off."""
-    labels: np.ndarray
-    """Pair and label of points that may lie on the edge, as one number, ascending."""
+    strips: np.ndarray
+    """Pair and patch of every strip, as one number, ascending."""
     width: int
     """Labels are below this."""
     contact: np.ndarray
     """Leaves where both patches of every pair are near, shape (P,)."""
 
+    def holds(self, pair: np.ndarray, label: np.ndarray) -> np.ndarray:
+        """Say which points are of the sides of an edge."""
+        return (label == self.pairs[:, 0][pair]) | (label == self.pairs[:, 1][pair])
+
     def allows(self, pair: np.ndarray, label: np.ndarray) -> np.ndarray:
         """Say which points may lie on an edge: those of its sides, its strips, of no patch."""
-        key = pair.astype(np.int64) * self.width + label
-        hit = np.minimum(np.searchsorted(self.labels, key), max(len(self.labels) - 1, 0))
-        return (label < 0) | (self.labels[hit] == key)
+        allowed = self.holds(pair, label) | (label < 0)
+        if len(self.strips):
+            other = np.flatnonzero(~allowed)
+            key = pair[other] * self.width + label[other]
+            hit = np.minimum(np.searchsorted(self.strips, key), len(self.strips) - 1)
+            allowed[other] = self.strips[hit] == key
+        return allowed
 
 
 class Search:
@@ -108,20 +117,33 @@ class Search:
         # The surfaces as they came; in the table they change when fillets are known.
         self.given = self.table.copy()
         self.set_sides()
-        # Distance of every point from the surface of its patch [mm], capped.
-        own = np.append(np.where(self.analytic, np.arange(self.count), NONE), NONE)[label]
-        far = distances_to_surfaces(
-            points, own, self.table[:, 8].astype(np.int32), self.table[:, :8]
-        )
-        self.off = np.minimum(np.abs(far), CAP * noise)
-        off = self.off[label >= 0]
-        # How far points are from the surfaces of their patches [mm].
-        self.usual = float(np.sqrt(np.mean(off**2))) if len(off) else noise
         self.own = label_lists(leaves, label)
         self.near = near_lists(leaves, self.own)
         self.claim = np.full(len(label), NONE, np.int32)
         # Points on the balls of corners, which say nothing about the tubes that end there.
         self.held = np.zeros(len(label), bool)
+
+    @cached_property
+    def off(self) -> np.ndarray:
+        """Distance of every point from the surface that its patch came with [mm], capped, (n,)."""
+        own = np.append(np.where(self.analytic, np.arange(self.count), NONE), NONE)
+        kind, parameters = self.given[:, 8], self.given[:, :8]
+        far = distances_to_surfaces(
+            self.device[0], own.astype(np.int32)[self.label], kind, parameters
+        )
+        return np.minimum(np.abs(far), CAP * self.noise)
+
+    @cached_property
+    def usual(self) -> float:
+        """How far points are from the surfaces of their patches [mm]."""
+        off = self.off[self.label >= 0]
+        return float(np.sqrt(np.mean(off**2))) if len(off) else self.noise
+
+    @cached_property
+    def balls(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centre and radius of a ball around the points of every leaf, shape (C, 3) and (C,)."""
+        low, high = self.leaves.box[:, :3], self.leaves.box[:, 3:]
+        return 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
 
     def leaf_of(self, point: np.ndarray) -> np.ndarray:
         """Return the leaves that hold some points, shape (E,)."""
@@ -131,10 +153,9 @@ class Search:
     def set_sides(self) -> None:
         """Say for every surface on which side the air is."""
         index, owner = listed([spread(m, _SIDE) for m in self.members])
-        _, outward = evaluate_surfaces(
-            self.points[index], owner, self.table[:, 8].astype(np.int32), self.table[:, :8]
-        )
-        cosine = np.nan_to_num(np.einsum("ij,ij->i", outward, self.normals[index]))
+        points, normals = np.take(self.points, index, axis=0), np.take(self.normals, index, axis=0)
+        _, outward = evaluate_surfaces(points, owner, self.table[:, 8], self.table[:, :8])
+        cosine = np.nan_to_num(np.einsum("ij,ij->i", outward, normals))
         self.table[:, 9] = np.where(np.bincount(owner, cosine, self.count) < 0.0, -1.0, 1.0)
 
     def place(
@@ -157,10 +178,15 @@ class Search:
         return place(device, device, self.table, pairs, radius, point, pair).along <= reach
 
     def sums(
-        self, task: np.ndarray, shape: np.ndarray, entry: np.ndarray, cap: float
+        self,
+        task: np.ndarray,
+        shape: np.ndarray,
+        entry: np.ndarray,
+        cap: float,
+        limit: np.ndarray | None = None,
     ) -> np.ndarray:
         """Sum up how profiles fit."""
-        return sums(self.device[0], self.table, task, shape, entry, cap)
+        return sums(self.device[0], self.table, task, shape, entry, cap, limit)
 
     def reach(self, turn: np.ndarray) -> np.ndarray:
         """Return how far from the sharp edge a fillet can reach [mm]."""
@@ -198,10 +224,28 @@ class Search:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the cost of every radius for every task, and the points on its ball."""
         cap = self.coarse()
-        shape = np.column_stack([np.tile(radii, len(task)), np.repeat(hollow, len(radii))])
-        got = self.sums(np.repeat(task, len(radii), axis=0), shape, point, cap)
-        got = got.reshape(len(task), len(radii), 4)
+        got = self.sums(task, _shapes(radii, hollow), point, cap)
         return got[..., 0] / cap**2, got[..., 3]
+
+    def best(
+        self, task: np.ndarray, radii: np.ndarray, hollow: np.ndarray, point: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the radius of least cost for every task, and by how much that is below no radius.
+
+        The gain is in squares of the noise; where that is 0 or less the radius may be any.
+        """
+        if len(task) == 0 or len(radii) == 0:
+            return np.zeros(len(task)), np.zeros(len(task))
+        cap = self.coarse()
+        sharp = self.sums(task, _shapes(np.zeros(1), hollow), point, cap)[:, 0, 0]
+        cost = self.sums(task, _shapes(radii, hollow), point, cap, sharp)[..., 0]
+        gain = (sharp - cost.min(axis=1)) / cap**2 * (cap / self.noise) ** 2
+        return radii[cost.argmin(axis=1)], gain
+
+
+def _shapes(radii: np.ndarray, hollow: np.ndarray) -> np.ndarray:
+    """Return all radii for every task, each with the sign of that, as `profiles.sums` takes it."""
+    return np.stack(np.broadcast_arrays(radii, hollow[:, None]), axis=2)
 
 
 def listed(sets: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -210,18 +254,32 @@ def listed(sets: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return (np.concatenate(sets) if sets else np.zeros(0, np.int64)), owner
 
 
-def tasks(pairs: np.ndarray, pair: np.ndarray) -> np.ndarray:
+def starts_of(owner: np.ndarray, count: int) -> np.ndarray:
+    """Return the first entry of each of so many owners, which ascend, and the end, (count + 1,)."""
+    return np.searchsorted(owner, np.arange(count + 1))
+
+
+def tasks(pairs: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Return both surfaces of every pair and the range of its entries, shape (P, 4)."""
-    total = np.bincount(pair, minlength=len(pairs))
-    ends = np.cumsum(total)
-    return np.column_stack([pairs, ends - total, ends])
+    return np.column_stack([pairs, start[:-1], start[1:]])
 
 
-def thinned(owner: np.ndarray, pairs: int, most: int) -> np.ndarray:
-    """Return which entries to keep so that every pair keeps at most about so many, evenly."""
-    total = np.bincount(owner, minlength=pairs)
-    rank = np.arange(len(owner)) - (np.cumsum(total) - total)[owner]
-    return rank % np.maximum(-(-total // most), 1)[owner] == 0
+def thinned(start: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return which entries to keep so that every pair keeps at most about so many, evenly.
+
+    Args:
+        start: First entry of every pair, and the end, shape (P + 1,).
+        most: Entries of a pair.
+
+    Returns:
+        The entries, ascending, and the first of every pair among these, as ``start``.
+    """
+    total = np.diff(start)
+    step = np.maximum(-(-total // most), 1)
+    count = -(-total // step)
+    rank = ranges(np.zeros(len(count), np.int64), count)
+    kept = np.repeat(start[:-1], count) + np.repeat(step, count) * rank
+    return kept, np.append(0, np.cumsum(count))
 
 
 def pairs_near(near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -248,28 +306,33 @@ def strips_between(search: Search, touching: np.ndarray) -> np.ndarray:
     """
     both = np.concatenate([touching, touching[:, ::-1]])
     both = both[search.analytic[both[:, 1]]]
-    sets = [np.sort(both[both[:, 0] == s, 1]) for s in range(search.count)]
-    triples = [np.zeros((0, 3), np.int64)]
-    for s, sides in enumerate(sets):
-        i, j = np.triu_indices(len(sides), 1)
-        triples.append(np.column_stack([np.full(len(i), s), sides[i], sides[j]]))
-    triple = np.concatenate(triples)
-    samples = [spread(m, _STRIP) for m in search.members]
+    patch, side = both[np.lexsort((both[:, 1], both[:, 0]))].T
+    # Every two neighbours of a patch.
+    here = np.arange(len(patch))
+    others = np.searchsorted(patch, patch, side="right") - here - 1
+    i, j = np.repeat(here, others), ranges(here + 1, others)
+    triple = np.column_stack([patch[i], side[i], side[j]])
     if len(triple) == 0:
         return triple
-    entry, owner = listed([samples[s] for s in triple[:, 0]])
+    sample, of = listed([spread(m, _STRIP) for m in search.members])
+    start = starts_of(of, search.count)
+    each = np.diff(start)[triple[:, 0]]
+    entry, owner = sample[ranges(start[triple[:, 0]], each)], np.repeat(np.arange(len(each)), each)
     at = search.place(triple[:, 1:], np.zeros(len(triple)), entry, owner)
-    inside = (at.region != NOWHERE) & (at.along <= search.reach(at.turn))
+    inside = at.along <= search.reach(at.turn)
     height = np.bincount(owner, inside * np.sign(at.height), len(triple))
     fewest = np.minimum(_LOCAL, _BETWEEN * search.size[triple[:, 0]])
     kept = np.bincount(owner, inside, len(triple)) >= fewest
-    entry, owner = entry[inside & kept[owner]], (np.cumsum(kept) - 1)[owner[inside & kept[owner]]]
+    inside &= kept[owner]
+    entry, owner = entry[inside], (np.cumsum(kept) - 1)[owner[inside]]
     triple, fewest = triple[kept], fewest[kept]
     hollow = np.where(height[kept] < 0.0, -1.0, 1.0)
     if len(triple) == 0:
         return triple
     radii = search.radii(_RATIO)
-    cost, on = search.tried(tasks(triple[:, 1:], owner), radii, hollow, entry)
+    cost, on = search.tried(
+        tasks(triple[:, 1:], starts_of(owner, len(triple))), radii, hollow, entry
+    )
     best = (on - cost).argmax(axis=1)
     at = search.place(triple[:, 1:], hollow * radii[best], entry, owner)
     between = np.bincount(owner, at.region == BALL, len(triple))
@@ -286,7 +349,8 @@ def find_zones(search: Search, strips: np.ndarray | None = None) -> Zones:
     """
     pairs, leaf = pairs_near(search.near)
     width, cells = search.count + 1, len(search.leaves)
-    touching = np.unique(pairs[:, 0].astype(np.int64) * width + pairs[:, 1])
+    code = pairs[:, 0].astype(np.int64) * width + pairs[:, 1]
+    touching = distinct(code)
     triple = strips_between(search, np.column_stack([touching // width, touching % width]))
     if strips is not None:
         triple = np.unique(np.concatenate([triple, strips]), axis=0)
@@ -294,8 +358,8 @@ def find_zones(search: Search, strips: np.ndarray | None = None) -> Zones:
     # Large leaves are far inside a patch: their points say nothing about its edges.
     size = search.leaves.size
     small = size <= max(2.0 * size.min(), search.absorbed())
-    real = search.analytic[pairs].all(axis=1)
-    met = pairs[real, 0].astype(np.int64) * width + pairs[real, 1]
+    real = search.analytic[pairs[:, 0]] & search.analytic[pairs[:, 1]]
+    met = code[real]
     key = np.concatenate(
         [
             met * cells + leaf[real],
@@ -310,31 +374,26 @@ def find_zones(search: Search, strips: np.ndarray | None = None) -> Zones:
     pairs = np.column_stack([code // width, code % width])
     fine = small[key % cells]
     fine |= (np.bincount(which, fine, len(code)) == 0)[which]
-    number = np.arange(len(code))
     between = np.searchsorted(code, triple[:, 1] * width + triple[:, 2])
-    labels = np.unique(
-        np.concatenate(
-            [number * width + pairs[:, 0], number * width + pairs[:, 1],
-             between * width + triple[:, 0]]
-        )
-    )  # fmt: skip
+    strips = distinct(between * width + triple[:, 0])
     met = np.bincount(np.searchsorted(code, met), minlength=len(code))
-    return Zones(pairs, which, key % cells, fine, labels, width, met)
+    return Zones(pairs, which, key % cells, fine, strips, width, met)
 
 
 def leaves_between(search: Search, triple: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the leaves of strips near the edges they lie on, and the triple of each."""
+    if len(triple) == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     cell, rank = np.nonzero(search.own >= 0)
     name = search.own[cell, rank]
     order = np.argsort(name, kind="stable")
     cell, first = cell[order], np.searchsorted(name[order], np.arange(search.count + 1))
     each = (first[1:] - first[:-1])[triple[:, 0]]
     leaf, owner = cell[ranges(first[triple[:, 0]], each)], np.repeat(np.arange(len(triple)), each)
-    low, high = search.leaves.box[:, :3], search.leaves.box[:, 3:]
-    wide = 0.5 * np.linalg.norm(high - low, axis=1)
+    middle, wide = search.balls
     # How far fillets reach at most: the nearer ones are picked where points are placed.
     near = search.near_edge(
-        triple[:, 1:], np.zeros(len(triple)), 0.5 * (low + high), leaf, owner,
+        triple[:, 1:], np.zeros(len(triple)), middle, leaf, owner,
         search.reach(np.full(1, np.pi)) + wide[leaf],
     )  # fmt: skip
     return owner[near], leaf[near]

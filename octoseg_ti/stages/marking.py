@@ -15,22 +15,22 @@ _ASIDE = 2.25
 @ti.func
 def _in_leaf(
     point_in: ti.template(), mark_in: ti.template(), leaf_in: ti.template(), box_in: ti.template(),
-    c: ti.i32, i: ti.i32, wanted: ti.i32, limit: ti.f64,
-):  # fmt: skip
-    """Return the least squared distance from point i to a point of leaf c with the mark."""
-    least = limit
-    held = leaf_in[c, 2] <= wanted and wanted <= leaf_in[c, 3]
-    if held and box_gap(box_in, c, row(point_in, i)) < limit:
-        for j in range(leaf_in[c, 0], leaf_in[c, 0] + leaf_in[c, 1]):
-            if mark_in[j] == wanted and j != i:
-                least = ti.min(least, (row(point_in, j) - row(point_in, i)).norm_sqr())
-    return least
+    c: ti.i32, i: ti.i32, wanted: ti.i32, square: ti.f64,
+) -> ti.i32:  # fmt: skip
+    """Say whether leaf c has a point with the mark that is nearer to point i than the reach."""
+    found = 0
+    if leaf_in[c, 2] <= wanted and wanted <= leaf_in[c, 3]:
+        p = row(point_in, i)
+        if box_gap(box_in, c, p) < square:
+            for j in range(leaf_in[c, 0], leaf_in[c, 0] + leaf_in[c, 1]):
+                if mark_in[j] == wanted and (row(point_in, j) - p).norm_sqr() < square and j != i:
+                    found = 1
+                    break
+    return found
 
 
 @ti.kernel
-def _nearest(
-    entries: ti.i32,
-    enough: ti.f64,
+def _look_for_marked(
     # In:
     point_in: F64Rows,
     mark_in: I32Array,
@@ -39,40 +39,38 @@ def _nearest(
     start_in: I32Array,
     neighbor_in: I32Array,
     entry_in: I32Rows,
+    reach_in: F64Array,
     # Out:
-    distance_inout: F64Array,
+    found_out: I32Array,
 ):
-    """Look for the nearest marked point in the leaf of every entry and those that touch it.
-
-    What is nearer than a share of the reach is near enough: then the search stops.
-    """
-    for e in range(entries):
+    """Look for a marked point in the leaf of every entry and those that touch it."""
+    for e in range(entry_in.shape[0]):
         i = entry_in[e, 0]
         c = entry_in[e, 1]
         wanted = entry_in[e, 2]
-        reach = distance_inout[e] * distance_inout[e]
-        least = _in_leaf(point_in, mark_in, leaf_in, box_in, c, i, wanted, reach)
+        square = reach_in[e] * reach_in[e]
+        found = _in_leaf(point_in, mark_in, leaf_in, box_in, c, i, wanted, square)
         k = start_in[c]
-        while k < start_in[c + 1] and least >= enough * reach:
-            least = _in_leaf(point_in, mark_in, leaf_in, box_in, neighbor_in[k], i, wanted, least)
+        while k < start_in[c + 1] and found == 0:
+            found = _in_leaf(point_in, mark_in, leaf_in, box_in, neighbor_in[k], i, wanted, square)
             k += 1
         k = start_in[c]
         # The leaves beyond matter where those that touch are smaller than the reach.
-        while k < start_in[c + 1] and least >= reach:
+        while k < start_in[c + 1] and found == 0:
             b = neighbor_in[k]
             j = start_in[b]
-            if box_gap(box_in, b, row(point_in, i)) > _ASIDE * reach:
+            if box_gap(box_in, b, row(point_in, i)) > _ASIDE * square:
                 j = start_in[b + 1]
-            while j < start_in[b + 1] and least >= reach:
-                least = _in_leaf(
-                    point_in, mark_in, leaf_in, box_in, neighbor_in[j], i, wanted, least
+            while j < start_in[b + 1] and found == 0:
+                found = _in_leaf(
+                    point_in, mark_in, leaf_in, box_in, neighbor_in[j], i, wanted, square
                 )
                 j += 1
             k += 1
-        distance_inout[e] = ti.select(least < reach, ti.sqrt(least), ti.math.inf)
+        found_out[e] = found
 
 
-def nearest_marked(
+def marked_near(
     points: object,
     mark: np.ndarray,
     leaves: Leaves,
@@ -80,10 +78,8 @@ def nearest_marked(
     leaf: np.ndarray,
     wanted: np.ndarray,
     reach: np.ndarray,
-    *,
-    exact: bool = False,
 ) -> np.ndarray:
-    """Return the distance to a point near by that carries a mark [mm], infinite if there is none.
+    """Say which points have another one near them that carries a mark, shape (E,), bool.
 
     Leaves that touch that of a point are searched, and those that touch these while nothing was
     found.
@@ -95,26 +91,26 @@ def nearest_marked(
         point: Point of every entry, shape (E,).
         leaf: Its leaf, shape (E,).
         wanted: The mark that is looked for, shape (E,).
-        reach: Largest distance [mm], shape (E,).
-        exact: Return the least distance, not just one within reach.
+        reach: The other point is nearer than this [mm], shape (E,).
     """
     runtime.ensure_started()
     entries = len(point)
     if entries == 0:
-        return np.zeros(0)
-    distance = runtime.upload(reach.astype(np.float64))
-    marks = mark.astype(np.int32)
+        return np.zeros(0, bool)
+    marks = mark.astype(np.int32, copy=False)
     low, high = np.minimum.reduceat(marks, leaves.first), np.maximum.reduceat(marks, leaves.first)
-    _nearest(
-        entries,
-        0.0 if exact else 1.0,
+    entry = np.empty((entries, 3), np.int32)
+    entry[:, 0], entry[:, 1], entry[:, 2] = point, leaf, wanted
+    found = runtime.empty(entries, np.int32)
+    _look_for_marked(
         points,
         runtime.upload(marks),
         runtime.upload(np.stack([leaves.first, leaves.count, low, high], axis=1)),
         runtime.upload(leaves.box),
         runtime.upload(leaves.start),
         runtime.upload(leaves.neighbor),
-        runtime.upload(np.stack([point, leaf, wanted], axis=1).astype(np.int32)),
-        distance,
+        runtime.upload(entry),
+        runtime.upload(reach.astype(np.float64)),
+        found,
     )
-    return runtime.download(distance)[:entries]
+    return runtime.download(found)[:entries] > 0

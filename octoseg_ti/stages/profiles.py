@@ -15,7 +15,10 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F64Array, F64Rows, I32Array, I32Rows, ti
-from octoseg_ti.device.surfaces import surface_at
+from octoseg_ti.device.surfaces import surface_at, vec4
+from octoseg_ti.types import EdgeClass
+
+SHARP, SMOOTH = int(EdgeClass.SHARP), int(EdgeClass.SMOOTH)
 
 BALL, FIRST, SECOND, NOWHERE = 0, 1, 2, 3
 """Where a point lies on a profile: between the lines of contact, beyond the first or the second
@@ -28,6 +31,7 @@ _CLOSE, _FAR = (
 )  # a centre is found when so near its distances [mm]; it is none so far off
 _PARALLEL = 1e-6  # squared sine of the angle between surfaces below which they have no edge
 
+_SHARES = 32  # parts in which threads take tasks, however few these are
 _SHARP = 1e-9  # a smaller radius is none [mm]
 
 vec9 = ti.types.vector(9, ti.f64)
@@ -42,30 +46,37 @@ class Places(NamedTuple):
     """Distance from the nearer line of contact, along the surface [mm]; 0 between the lines of a
     round edge. Infinite where there is no edge near."""
     region: np.ndarray
-    """BALL, FIRST, SECOND or NOWHERE, i32."""
-    turn: np.ndarray
-    """Angle by which the surface turns from one side of the edge to the other [rad]."""
+    """BALL, FIRST, SECOND or NOWHERE."""
+    bend: np.ndarray
+    """Cosine of the turn."""
     cosine: np.ndarray
     """Cosine of the angle between the normals of the point and of the profile."""
     height: np.ndarray
     """Heights above both surfaces, added up [mm]: above 0 = a concave edge."""
 
+    @property
+    def turn(self) -> np.ndarray:
+        """Angle by which the surface turns from one side of the edge to the other [rad]."""
+        return np.arccos(np.clip(self.bend, -1.0, 1.0))
+
 
 @ti.func
-def _side_at(surface_in: ti.template(), s: ti.i32, p: vec3):
-    """Return (height of a point above a surface, its normal there), on the side of the air."""
+def _side_at(surface_in: ti.template(), s: ti.i32, p: vec3) -> vec4:
+    """Return (normal of a surface at a point (3), height of that), on the side of the air."""
     axis = vec3(surface_in[s, 3], surface_in[s, 4], surface_in[s, 5])
     d, n = surface_at(
         ti.cast(surface_in[s, 8], ti.i32), p, row(surface_in, s), axis, surface_in[s, 6],
         surface_in[s, 7],
     )  # fmt: skip
     side = surface_in[s, 9]
-    return side * d, side * n
+    return vec4(side * n[0], side * n[1], side * n[2], side * d)
 
 
 @ti.func
-def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, radius: ti.f64,
-                     hollow: ti.f64) -> vec9:  # fmt: skip
+def _place_on_profile(
+    surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, side_a: vec4, side_b: vec4,
+    radius: ti.f64, hollow: ti.f64,
+) -> vec9:  # fmt: skip
     """Return (off, along, region, cosine of the turn, change of off, normal (3), height).
 
     The change is that with the radius; the height is the sum of the heights above both surfaces.
@@ -77,13 +88,17 @@ def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, r
         a: The first surface.
         b: The second one.
         p: The point.
+        side_a: What `_side_at` says of the first surface there.
+        side_b: What it says of the second one.
         radius: Radius of the ball [mm], 0 or more.
         hollow: 1 for a concave edge, -1 for a convex one.
     """
     c = p
     signed = hollow * radius
-    ca, ma = _side_at(surface_in, a, p)
-    cb, mb = _side_at(surface_in, b, p)
+    ca = side_a[3]
+    cb = side_b[3]
+    ma = vec3(side_a[0], side_a[1], side_a[2])
+    mb = vec3(side_b[0], side_b[1], side_b[2])
     da = ca
     db = cb
     step = 0
@@ -95,8 +110,12 @@ def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, r
             x = signed - ca
             y = signed - cb
             c += ((x - g * y) / det) * ma + ((y - g * x) / det) * mb
-            ca, ma = _side_at(surface_in, a, c)
-            cb, mb = _side_at(surface_in, b, c)
+            at_a = _side_at(surface_in, a, c)
+            at_b = _side_at(surface_in, b, c)
+            ca = at_a[3]
+            cb = at_b[3]
+            ma = vec3(at_a[0], at_a[1], at_a[2])
+            mb = vec3(at_b[0], at_b[1], at_b[2])
         else:
             step = _STEPS
     off = da
@@ -109,8 +128,8 @@ def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, r
         u = p - c
         x = -hollow * u.dot(ma)
         y = -hollow * u.dot(mb)
-        toward_a = (x - g * y) / det
-        toward_b = (y - g * x) / det
+        toward_a = x - g * y
+        toward_b = y - g * x
         size = u.norm()
         change = 0.0
         region = BALL
@@ -140,6 +159,16 @@ def place_on_profile(surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, r
     return result
 
 
+@ti.func
+def place_on_profile(
+    surface_in: ti.template(), a: ti.i32, b: ti.i32, p: vec3, radius: ti.f64, hollow: ti.f64
+) -> vec9:
+    """Return what `_place_on_profile` does of a point about which nothing is known yet."""
+    side_a = _side_at(surface_in, a, p)
+    side_b = _side_at(surface_in, b, p)
+    return _place_on_profile(surface_in, a, b, p, side_a, side_b, radius, hollow)
+
+
 @ti.kernel
 def _place(
     entries: ti.i32,
@@ -162,48 +191,113 @@ def _place(
             surface_in, pair_in[m, 0], pair_in[m, 1], row(point_in, entry_in[e, 0]), radius, hollow
         )
         for k in ti.static(range(4)):
-            place_out[e, k] = f[k]
-        place_out[e, 4] = vec3(f[5], f[6], f[7]).dot(row(normal_in, entry_in[e, 0]))
-        place_out[e, 5] = f[8]
+            place_out[k, e] = f[k]
+        place_out[4, e] = vec3(f[5], f[6], f[7]).dot(row(normal_in, entry_in[e, 0]))
+        place_out[5, e] = f[8]
 
 
 @ti.kernel
 def _sum_up(
-    tasks: ti.i32,
+    stride: ti.i32,
     cap: ti.f64,
     # In:
     point_in: F64Rows,
     surface_in: F64Rows,
     task_in: I32Rows,
     shape_in: F64Rows,
+    limit_in: F64Array,
     entry_in: I32Array,
     # Out:
-    sum_out: F64Rows,
+    sum_inout: F64Rows,
 ):
-    """Sum capped squares, gradient, curvature and points on the ball over the points of a task."""
-    for t in range(tasks):
-        cost = 0.0
-        gradient = 0.0
-        curvature = 0.0
-        count = 0.0
-        for j in range(task_in[t, 2], task_in[t, 3]):
-            f = place_on_profile(
-                surface_in, task_in[t, 0], task_in[t, 1], row(point_in, entry_in[j]),
-                shape_in[t, 0], shape_in[t, 1],
-            )  # fmt: skip
-            off = f[0]
-            if ti.abs(off) < cap:
-                cost += off * off
-                if ti.cast(f[2], ti.i32) == BALL:
-                    gradient += off * f[4]
-                    curvature += f[4] * f[4]
-                    count += 1.0
-            else:
-                cost += cap * cap
-        sum_out[t, 0] = cost
-        sum_out[t, 1] = gradient
-        sum_out[t, 2] = curvature
-        sum_out[t, 3] = count
+    """Sum capped squares, gradient, curvature and points on the ball over the points of a task.
+
+    All shapes of a task, as many for each, share what is known of a point. What costs more than the
+    limit of the task is not added up any further.
+    """
+    shapes = shape_in.shape[0] // task_in.shape[0]
+    for u in range(task_in.shape[0] * stride):
+        if u % stride == 0:
+            t = u // stride
+            a = task_in[t, 0]
+            b = task_in[t, 1]
+            for j in range(task_in[t, 2], task_in[t, 3]):
+                p = row(point_in, entry_in[j])
+                side_a = _side_at(surface_in, a, p)
+                side_b = _side_at(surface_in, b, p)
+                for k in range(t * shapes, (t + 1) * shapes):
+                    if sum_inout[k, 0] <= limit_in[t]:
+                        f = _place_on_profile(
+                            surface_in, a, b, p, side_a, side_b, shape_in[k, 0], shape_in[k, 1]
+                        )
+                        off = f[0]
+                        if ti.abs(off) < cap:
+                            sum_inout[k, 0] += off * off
+                            if ti.cast(f[2], ti.i32) == BALL:
+                                sum_inout[k, 1] += off * f[4]
+                                sum_inout[k, 2] += f[4] * f[4]
+                                sum_inout[k, 3] += 1.0
+                        else:
+                            sum_inout[k, 0] += cap * cap
+
+
+@ti.func
+def _may_lie(edge_in: ti.template(), strip_in: ti.template(), m: ti.i32, label: ti.i32) -> ti.i32:
+    """Say whether a point with this label may lie on edge m: on a side; on a strip if it is round.
+
+    A round edge also takes points without a label.
+    """
+    found = ti.cast(label == edge_in[m, 0] or label == edge_in[m, 1], ti.i32)
+    if found == 0 and edge_in[m, 2] != SHARP and edge_in[m, 2] != SMOOTH:
+        found = ti.cast(label < 0, ti.i32)
+        for k in range(edge_in[m, 3], edge_in[m, 4]):
+            found |= ti.cast(strip_in[k] == label, ti.i32)
+    return found
+
+
+@ti.kernel
+def _reach_along(
+    limit: ti.types.vector(3, ti.f64),
+    # In:
+    point_in: F64Rows,
+    label_in: I32Array,
+    surface_in: F64Rows,
+    edge_in: I32Rows,
+    radius_in: F64Array,
+    strip_in: I32Array,
+    entry_in: I32Rows,
+    # Out:
+    along_out: F64Array,
+):
+    """Write how far points of leaves are from an edge along the surface; infinite: not beside it.
+
+    An edge lies on both surfaces: what is far from the other one is far from a sharp edge. A smooth
+    joint has no line: all points of its sides are beside it.
+    """
+    for e in range(entry_in.shape[0]):
+        m = entry_in[e, 0]
+        sharp = edge_in[m, 2] == SHARP
+        radius = ti.abs(radius_in[m])
+        hollow = ti.select(radius_in[m] < 0.0, -1.0, 1.0)
+        for k in range(entry_in[e, 2]):
+            i = entry_in[e, 1] + k
+            along = ti.math.inf
+            if _may_lie(edge_in, strip_in, m, label_in[i]) == 1:
+                far = 0.0
+                if sharp:
+                    other = ti.select(label_in[i] == edge_in[m, 0], edge_in[m, 1], edge_in[m, 0])
+                    far = _side_at(surface_in, other, row(point_in, i))[3]
+                if edge_in[m, 2] == SMOOTH:
+                    along = 0.0
+                elif ti.abs(far) <= limit[0]:
+                    f = place_on_profile(
+                        surface_in, edge_in[m, 0], edge_in[m, 1], row(point_in, i), radius, hollow
+                    )
+                    ball = ti.cast(f[2], ti.i32) == BALL
+                    fits = ti.abs(f[0]) <= ti.select(ball, limit[1], limit[2]) or (ball and sharp)
+                    if fits and f[1] <= limit[0]:
+                        along = f[1]
+            along_out[entry_in[e, 3] + k] = along
 
 
 def place(
@@ -230,9 +324,10 @@ def place(
     runtime.ensure_started()
     entries = len(point)
     if entries == 0:
-        none = np.zeros(0)
-        return Places(none, none, np.zeros(0, np.int32), none, none, none)
-    out = runtime.empty((entries, 6), np.float64)
+        return Places(*np.zeros((6, 0)))
+    out = runtime.empty((6, entries), np.float64)
+    entry = np.empty((entries, 2), np.int32)
+    entry[:, 0], entry[:, 1] = point, edge
     _place(
         entries,
         points,
@@ -240,13 +335,71 @@ def place(
         runtime.upload(surfaces),
         runtime.upload(pairs.astype(np.int32)),
         runtime.upload(radius.astype(np.float64)),
-        runtime.upload(np.column_stack([point, edge]).astype(np.int32)),
+        runtime.upload(entry),
         out,
     )
-    found = runtime.download(out)
-    turn = np.arccos(np.clip(found[:, 3], -1.0, 1.0))
-    region = found[:, 2].astype(np.int32)
-    return Places(found[:, 0], found[:, 1], region, turn, found[:, 4], found[:, 5])
+    return Places(*runtime.download(out))
+
+
+def points_beside(
+    points: Any,
+    label: np.ndarray,
+    surfaces: np.ndarray,
+    edges: np.ndarray,
+    strips: np.ndarray,
+    radius: np.ndarray,
+    edge: np.ndarray,
+    first: np.ndarray,
+    count: np.ndarray,
+    *,
+    reach: float,
+    on_ball: float,
+    on_side: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the points of ranges that are beside an edge.
+
+    Beside a smooth joint are all points of its sides; beside a sharp edge those on its profile;
+    beside a round one also those of its strips, and those without a label.
+
+    Args:
+        points: Positions [mm], shape (n, 3) (kernel array).
+        label: Surface of every point, -1 = none, shape (n,), i32.
+        surfaces: As for `place`.
+        edges: Both surfaces of every edge, its `EdgeClass`, and the range of its strips, (P, 5).
+        strips: Labels of points that lie on round edges, edge after edge.
+        radius: Signed radius of every edge [mm], above 0 = concave, shape (P,).
+        edge: Edge of every range, shape (E,).
+        first: First point of every range, shape (E,).
+        count: Its points, shape (E,).
+        reach: Largest distance along the surface [mm]; and from the other one, at sharp edges.
+        on_ball: Largest distance from the profile of a round edge between its lines [mm].
+        on_side: Largest distance from the profile on the sides [mm].
+
+    Returns:
+        The points, the range of each, and how far it is from the edge along the surface [mm], 0 at
+        smooth joints; range after range.
+    """
+    runtime.ensure_started()
+    if len(edge) == 0:
+        none = np.zeros(0, np.int64)
+        return none, none, np.zeros(0)
+    ends = np.cumsum(count, dtype=np.int64)
+    along = runtime.empty(int(ends[-1]), np.float64)
+    _reach_along(
+        (reach, on_ball, on_side),
+        points,
+        runtime.upload(label),
+        runtime.upload(surfaces),
+        runtime.upload(edges.astype(np.int32)),
+        runtime.upload(radius.astype(np.float64)),
+        runtime.upload(strips.astype(np.int32)),
+        runtime.upload(np.column_stack([edge, first, count, ends - count]).astype(np.int32)),
+        along,
+    )
+    far = runtime.download(along)[: ends[-1]]
+    beside = np.flatnonzero(far < np.inf)
+    which = np.searchsorted(ends, beside, side="right")
+    return beside + (first - (ends - count))[which], which, far[beside]
 
 
 def sums(
@@ -256,6 +409,7 @@ def sums(
     shape: np.ndarray,
     entry: np.ndarray,
     cap: float,
+    limit: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return how well profiles fit.
 
@@ -263,26 +417,28 @@ def sums(
         points: Positions [mm], shape (n, 3) (kernel array).
         surfaces: As for `place`.
         task: First surface, second surface, first and last entry of every task, shape (T, 4).
-        shape: Radius [mm] and 1 for concave, -1 for convex, shape (T, 2).
+        shape: Radius [mm] and 1 for concave, -1 for convex of every profile, shape (T, R, 2).
         entry: Points, listed for tasks, shape (E,).
         cap: Distances beyond this count as this [mm].
+        limit: Where a sum of squares is above that of its task [mm^2], shape (T,), sums may leave
+            out points; None = none does.
 
     Returns:
-        Shape (T, 4): sum of the squares of distances [mm^2], half its gradient and curvature with
-        respect to the radius, and the points between the lines of contact.
+        Shape (T, R, 4): sum of the squares of distances [mm^2], half its gradient and curvature
+        with respect to the radius, and the points between the lines of contact.
     """
     runtime.ensure_started()
-    if len(task) == 0:
-        return np.zeros((0, 4))
-    out = runtime.empty((len(task), 4), np.float64)
-    _sum_up(
-        len(task),
-        cap,
-        points,
-        runtime.upload(surfaces),
-        runtime.upload(task.astype(np.int32)),
-        runtime.upload(shape.astype(np.float64)),
-        runtime.upload(entry.astype(np.int32)),
-        out,
-    )
-    return runtime.download(out)
+    total = runtime.zeros((shape.shape[0] * shape.shape[1], 4), np.float64)
+    if len(task):
+        _sum_up(
+            max(_SHARES * runtime.workers()[1] // len(task), 1),
+            cap,
+            points,
+            runtime.upload(surfaces),
+            runtime.upload(task.astype(np.int32)),
+            runtime.upload(shape.reshape(-1, 2).astype(np.float64)),
+            runtime.upload(np.full(len(task), np.inf) if limit is None else limit),
+            runtime.upload(entry.astype(np.int32)),
+            total,
+        )
+    return runtime.download(total)[: shape.shape[0] * shape.shape[1]].reshape(*shape.shape[:2], 4)

@@ -27,6 +27,7 @@ ENDED, BEHIND, PASSED, HIDDEN = 1, 2, 4, 8
 plane of the face; no further stripe; something in the plane or in front of it, or the end of the
 field of view."""
 
+_SHARES = 32  # parts in which threads take stripes
 _LANES = 2.0  # a point of another stripe is on the same ray within so many lanes
 _SLOPE = 0.02  # the plane of a face is known so well, far from it
 _TOWARDS = 0.3  # a side is open towards the free sector within the angle of this cosine
@@ -100,6 +101,7 @@ def _beside(
 @ti.kernel
 def _open_sides(
     gap: ti.f64,
+    stride: ti.i32,
     # In:
     asked_in: I32Array,
     point_in: F64Rows,
@@ -110,30 +112,33 @@ def _open_sides(
     side_out: I32Array,
 ):
     """Write on which sides a point has no neighbour, though it has one on the other side."""
-    for s in view_in:
-        last = view_in.shape[0] - 1
-        up = start_in[s + 1]
-        up_end = up
-        if s < last and view_in[ti.min(s + 1, last)] == view_in[s]:
-            up_end = start_in[s + 2]
-        down = start_in[ti.max(s - 1, 0)]
-        down_end = down
-        if s > 0 and view_in[ti.max(s - 1, 0)] == view_in[s]:
-            down_end = start_in[s]
-        for i in range(start_in[s], start_in[s + 1]):
-            side = 0
-            if asked_in[i] == 1:
+    last = view_in.shape[0] - 1
+    for u in range(view_in.shape[0] * stride):
+        if u % stride == 0:
+            s = u // stride
+            up = start_in[s + 1]
+            up_end = up
+            if s < last and view_in[ti.min(s + 1, last)] == view_in[s]:
+                up_end = start_in[s + 2]
+            down = start_in[ti.max(s - 1, 0)]
+            down_end = down
+            if s > 0 and view_in[ti.max(s - 1, 0)] == view_in[s]:
+                down_end = start_in[s]
+            ahead = 0
+            for i in range(start_in[s], start_in[s + 1]):
+                side = 0
+                back = ahead
                 ahead = _close(point_in, i, ti.select(i + 1 < start_in[s + 1], i + 1, -1), gap)
-                back = _close(point_in, i, ti.select(i > start_in[s], i - 1, -1), gap)
-                if ahead != back:
-                    side += ti.select(back == 1, NEXT, BEFORE)
-                next_near = 0
-                last_near = 0
-                up, next_near = _beside(point_in, lane_in, i, up, up_end, gap)
-                down, last_near = _beside(point_in, lane_in, i, down, down_end, gap)
-                if next_near != last_near:
-                    side += ti.select(last_near == 1, UP, DOWN)
-            side_out[i] = side
+                if asked_in[i] == 1:
+                    if ahead != back:
+                        side += ti.select(back == 1, NEXT, BEFORE)
+                    next_near = 0
+                    last_near = 0
+                    up, next_near = _beside(point_in, lane_in, i, up, up_end, gap)
+                    down, last_near = _beside(point_in, lane_in, i, down, down_end, gap)
+                    if next_near != last_near:
+                        side += ti.select(last_near == 1, UP, DOWN)
+                side_out[i] = side
 
 
 @ti.func
@@ -280,8 +285,10 @@ def open_sides(lines: Lines, asked: np.ndarray, gap: float) -> np.ndarray:
     """
     runtime.ensure_started()
     side = runtime.empty(len(lines.points), np.int32)
+    # Shared between threads although stripes are few.
+    stride = max(_SHARES * runtime.workers()[1] // max(len(lines.view), 1), 1)
     _open_sides(
-        gap, runtime.upload(asked.astype(np.int32)), runtime.upload(lines.points),
+        gap, stride, runtime.upload(asked.astype(np.int32)), runtime.upload(lines.points),
         runtime.upload(lines.start), runtime.upload(lines.view), runtime.upload(lines.lane), side,
     )  # fmt: skip
     return runtime.download(side)

@@ -5,6 +5,7 @@ thousands of points, so these are bounded in blocks, which are small because the
 Morton order.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,10 @@ FREE = SECTORS // 3
 """A point is at a border when so many sectors beside each other are free: a third of a turn."""
 BLOCK = 32
 """Sorted points that are bounded together."""
+
+
+_STEEPER = tuple(math.tan(2.0 * math.pi * k / SECTORS) for k in range(1, SECTORS // 4))
+"""Tangents of the angles between the sectors of a quarter."""
 
 
 @ti.kernel
@@ -43,6 +48,34 @@ def _bound_blocks(
 
 
 @ti.func
+def _sector(x: ti.f64, y: ti.f64) -> ti.i32:
+    """Return the sector in which a direction lies, counted from x towards y."""
+    sector = 0
+    if x <= 0.0 and y > 0.0:
+        x, y = y, -x
+        sector = SECTORS // 4
+    elif x < 0.0 and y <= 0.0:
+        x, y = -x, -y
+        sector = SECTORS // 2
+    elif x >= 0.0 and y < 0.0:
+        x, y = -y, x
+        sector = 3 * SECTORS // 4
+    for k in ti.static(range(len(_STEEPER))):
+        sector += ti.cast(x > 0.0 and y >= _STEEPER[k] * x, ti.i32)
+    return sector
+
+
+@ti.func
+def _at_border(held: ti.i32) -> ti.i32:
+    """Say whether enough sectors beside each other are free."""
+    free = ti.cast(~held & ((1 << SECTORS) - 1), ti.i64)
+    free |= free << SECTORS
+    for _ in ti.static(range(FREE - 1)):
+        free &= free >> 1
+    return ti.cast(free != 0, ti.i32)
+
+
+@ti.func
 def _occupied(
     point_in: ti.template(), leaf_in: ti.template(), block_in: ti.template(), c: ti.i32, p: vec3,
     u: vec3, v: vec3, square: ti.f64,
@@ -57,9 +90,7 @@ def _occupied(
                 step = row(point_in, j) - p
                 far = step.norm_sqr()
                 if far <= square and far > 0.0:
-                    turn = ti.atan2(step.dot(v), step.dot(u)) / (2.0 * ti.math.pi)
-                    k = ti.cast(ti.floor(turn * SECTORS), ti.i32)
-                    held |= 1 << ((k + SECTORS) % SECTORS)
+                    held |= 1 << _sector(step.dot(u), step.dot(v))
     return held
 
 
@@ -110,13 +141,9 @@ def _free_sectors(
         held = _occupied(point_in, leaf_in, block_in, c, p, u, v, square)
         # Small leaves end within the radius: those beyond count too. Few points get that far.
         for ring in range(2):
-            begin = start_in[c]
-            end = start_in[c + 1]
-            if _widest(held)[0] < FREE:
-                end = begin
-            for k in range(begin, end):
+            for k in range(start_in[c], start_in[c + 1]):
                 b = neighbor_in[k]
-                if box_gap(box_in, b, p) <= square:
+                if _at_border(held) == 1 and box_gap(box_in, b, p) <= square:
                     if ring == 0:
                         held |= _occupied(point_in, leaf_in, block_in, b, p, u, v, square)
                     elif leaf_in[b, 2] == 1:

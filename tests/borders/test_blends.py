@@ -115,9 +115,7 @@ def test_points_beside_a_blend_are_marked_and_stray_ones_are_not() -> None:
         leaves=leaves,
         device=(runtime.upload(points),),
     )
-    zones = Zones(
-        np.array([[0, 1]]), 0 * cells, cells, cells >= 0, np.array([0, 1]), 3, np.array([9])
-    )
+    zones = Zones(np.array([[0, 1]]), 0 * cells, cells, cells >= 0, cells[:0], 3, np.array([9]))
     edge = np.zeros(len(points), np.uint8)
     mark_blends(search, zones, np.array([False, True]), np.ones(1, bool), edge)  # type: ignore[arg-type]
     found = edge == int(EdgeClass.FILLET)

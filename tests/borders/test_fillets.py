@@ -10,7 +10,7 @@ from reference.leaves import leaves_of
 from reference.rounded import bend
 
 from octoseg_ti import evaluate, segment
-from octoseg_ti.borders.fillets import ON, Around, tasks, without_support
+from octoseg_ti.borders.fillets import ON, Around, starts_of, tasks, without_support
 from octoseg_ti.device import runtime
 from octoseg_ti.evaluation import Scores
 from octoseg_ti.types import NONE, EdgeClass, Segmentation, Truth
@@ -28,17 +28,19 @@ def ridge(radius: float, turn: float, noise: float) -> tuple[Segmentation, Truth
 def test_tasks_are_the_ranges_of_pairs() -> None:
     pairs = np.array([[4, 7], [1, 2], [3, 9]])
     np.testing.assert_array_equal(
-        tasks(pairs, np.array([0, 0, 2, 2, 2])), [[4, 7, 0, 2], [1, 2, 2, 2], [3, 9, 2, 5]]
+        tasks(pairs, starts_of(np.array([0, 0, 2, 2, 2]), 3)),
+        [[4, 7, 0, 2], [1, 2, 2, 2], [3, 9, 2, 5]],
     )
 
 
 def test_every_pair_keeps_about_so_many_points() -> None:
-    pair = np.repeat([0, 2, 3], [100, 3, 10])
     none = np.zeros(4)
-    around = Around(np.arange(113) * 2, pair, none, none, none)
-    point, kept = around.thinned(10)
-    np.testing.assert_array_equal(np.bincount(kept), [10, 0, 3, 10])
-    np.testing.assert_array_equal(point[kept == 0], np.arange(0, 200, 20))
+    around = Around(np.arange(124) * 2, np.array([0, 100, 100, 103, 124]), none, none, none)
+    point, start = around.thinned(10)
+    np.testing.assert_array_equal(np.diff(start), [10, 0, 3, 7])
+    np.testing.assert_array_equal(point[:10], np.arange(0, 200, 20))
+    np.testing.assert_array_equal(point[10:13], [200, 202, 204])
+    np.testing.assert_array_equal(point[13:], np.arange(206, 248, 6))
 
 
 @pytest.mark.parametrize("seed", range(3))

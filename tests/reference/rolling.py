@@ -48,3 +48,24 @@ def nearest(points: np.ndarray, mark: np.ndarray, i: int, wanted: int, reach: fl
     far = np.linalg.norm(points - points[i], axis=1)
     far[(mark != wanted) | (np.arange(len(points)) == i)] = np.inf
     return float(far.min()) if far.min() < reach else math.inf
+
+
+def beside(
+    faces: np.ndarray, edge: tuple[int, int, str], strips: set[int], label: int, p: np.ndarray,
+    radius: float, reach: float, on_ball: float, on_side: float,
+) -> float:  # fmt: skip
+    """Distance of a point from an edge along the surface, infinite where it is not beside that."""
+    a, b, form = edge
+    allowed = {a, b} if form != "fillet" else {a, b, -1} | strips
+    if label not in allowed:
+        return math.inf
+    if form == "smooth":
+        return 0.0
+    if form == "sharp" and abs(height(faces[b if label == a else a], p)[0]) > reach:
+        return math.inf
+    off, along, region, _ = profile(faces[a], faces[b], p, radius)
+    if region == BALL and abs(radius) < 1e-9:
+        along = abs(off)
+    fits = abs(off) <= (on_ball if region == BALL else on_side)
+    fits |= region == BALL and form == "sharp"
+    return along if fits and along <= reach else math.inf

@@ -7,8 +7,16 @@ import pytest
 from reference import rolling
 
 from octoseg_ti.device import runtime
-from octoseg_ti.stages.profiles import BALL, FIRST, NOWHERE, SECOND, place, sums
-from octoseg_ti.types import SurfaceKind
+from octoseg_ti.stages.profiles import (
+    BALL,
+    FIRST,
+    NOWHERE,
+    SECOND,
+    place,
+    points_beside,
+    sums,
+)
+from octoseg_ti.types import EdgeClass, SurfaceKind
 
 PLANE, CYLINDER, SPHERE = (
     int(k) for k in (SurfaceKind.PLANE, SurfaceKind.CYLINDER, SurfaceKind.SPHERE)
@@ -94,7 +102,10 @@ def test_sums_are_those_of_the_places_and_change_with_the_radius() -> None:
     device = runtime.upload(points)
     task, entry, cap = np.array([[0, 1, 0, 400]] * 3), np.arange(400), 0.6
     shape = np.array([[1.5 - 1e-5, 1.0], [1.5, 1.0], [1.5 + 1e-5, 1.0]])
-    got = sums(device, faces, task, shape, entry, cap)
+    got = sums(device, faces, task, shape[:, None], entry, cap)[:, 0]
+    # Shapes of one task give the same sums as tasks of one shape.
+    together = sums(device, faces, task[:1], shape[None], entry, cap)[0]
+    np.testing.assert_array_equal(together, got)
     at = placed(faces, points, 1.5)
     near = np.minimum(np.abs(at.off), cap)
     np.testing.assert_allclose(got[1, 0], np.sum(near**2), rtol=1e-9)
@@ -102,3 +113,64 @@ def test_sums_are_those_of_the_places_and_change_with_the_radius() -> None:
     # Half the slope of the cost, but for points that pass the cap meanwhile.
     np.testing.assert_allclose((got[2, 0] - got[0, 0]) / 4e-5, got[1, 1], rtol=0.02)
     assert got[1, 2] > 0.0
+
+
+def test_what_costs_more_than_the_limit_need_not_be_added_up() -> None:
+    rng = np.random.default_rng(3)
+    faces = np.array([surface(PLANE, (0, 0, 0), (0, 0, 1)), surface(PLANE, (0, 0, 0), (1, 0, 0.3))])
+    runtime.ensure_started()
+    device = runtime.upload(rng.uniform(-0.5, 2, (400, 3)))
+    task, entry = np.array([[0, 1, 0, 150], [0, 1, 150, 400]]), np.arange(400)
+    shape = np.stack([rng.uniform(0.2, 2.0, (2, 9)), np.ones((2, 9))], axis=2)
+    whole = sums(device, faces, task, shape, entry, 0.6)[..., 0]
+    limit = np.median(whole, axis=1)
+    got = sums(device, faces, task, shape, entry, 0.6, limit)[..., 0]
+    cheap = whole <= limit[:, None]
+    np.testing.assert_array_equal(got[cheap], whole[cheap])
+    assert np.all((got > limit[:, None])[~cheap]) and np.all(got <= whole)
+    assert np.any(got < whole)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_beside_edges_equal_the_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    faces = np.array([
+        surface(PLANE, (0, 0, 0), (0, 0, 1)), surface(PLANE, (0, 0, 0), (1, 0, 0.3)),
+        surface(CYLINDER, (0, 0, 0), (0, 1, 0), 1.0),
+    ])  # fmt: skip
+    points = rng.uniform(-1, 1.5, (300, 3)) * (1, 1, 0.4)
+    label = rng.integers(-1, 4, 300).astype(np.int32)
+    forms, radius = ("sharp", "smooth", "fillet"), np.array([1e-12, 0.0, 0.5])
+    code = [int(EdgeClass[form.upper()]) for form in forms]
+    edges = np.array([[0, 1, code[0], 0, 0], [1, 2, code[1], 0, 1], [0, 1, code[2], 1, 2]])
+    edge, first = np.array([0, 0, 1, 2, 2]), np.array([0, 100, 50, 0, 200])
+    count = np.array([70, 200, 60, 90, 100])
+    runtime.ensure_started()
+    limits = {"reach": 0.5, "on_ball": 0.1, "on_side": 0.2}
+    point, which, along = points_beside(
+        runtime.upload(points), label, faces, edges, np.array([0, 3]), radius, edge, first, count,
+        **limits,
+    )  # fmt: skip
+    got = {(k, i): far for k, i, far in zip(which, point, along, strict=True)}
+    expected = {}
+    for k, (m, begin, many) in enumerate(zip(edge, first, count, strict=True)):
+        for i in range(begin, begin + many):
+            far = rolling.beside(
+                faces, (edges[m, 0], edges[m, 1], forms[m]), {3}, label[i], points[i], radius[m],
+                **limits,
+            )  # fmt: skip
+            if np.isfinite(far):
+                expected[k, i] = far
+    assert list(got) == list(expected) and {k for k, _ in got} == {0, 1, 2, 3, 4}
+    np.testing.assert_allclose(list(got.values()), list(expected.values()), atol=1e-5)
+
+
+def test_beside_no_edge_is_nothing() -> None:
+    none = np.zeros(0, np.int64)
+    runtime.ensure_started()
+    found = points_beside(
+        runtime.upload(np.zeros((3, 3))), np.zeros(3, np.int32), np.zeros((1, 10)),
+        np.zeros((0, 5), np.int64), none, np.zeros(0), none, none, none,
+        reach=1.0, on_ball=1.0, on_side=1.0,
+    )  # fmt: skip
+    assert all(len(part) == 0 for part in found)
