@@ -34,6 +34,11 @@ _OPENING = 2
 _SPREAD_NOISES = 4.0
 _SPREAD_CURVED = 4.0
 _SAMPLES = 6000
+# The neighbours by number, the diagonal ones last: on which stripe, 0 for that of the point, 1 for
+# the one before, 2 for the one after, and how many steps from the nearest point there.
+_RING = (
+    (0, 0, -1), (1, 0, 1), (2, 1, 0), (3, 2, 0), (4, 1, -1), (5, 1, 1), (6, 2, -1), (7, 2, 1)
+)  # fmt: skip
 
 _vec3_f32 = ti.types.vector(3, ti.f32)
 
@@ -76,6 +81,20 @@ def _nearest_ahead(p: vec3, j: ti.i32, last: ti.i32, point: ti.template()) -> ti
     return at
 
 
+@ti.func
+def _linked(
+    i: ti.i32, j: ti.i32, first: ti.i32, last: ti.i32, gap: ti.f64, point: ti.template(),
+    normal: ti.template(),
+) -> ti.i32:  # fmt: skip
+    """Return j if it is one of its stripe, near to i and with a normal; else i."""
+    found = i
+    if j >= first and j <= last:
+        if (row(point, j) - row(point, i)).norm_sqr() <= gap * gap:
+            if _row32(normal, j).norm_sqr() > 0.25:
+                found = j
+    return found
+
+
 @ti.kernel
 def _link(
     lag: ti.i32,
@@ -98,33 +117,26 @@ def _link(
     for u in range(stripes * stride):
         s = u // stride
         if u % stride == 0:
-            for side in ti.static(range(3)):
-                other = s + ti.static((0, -1, 1)[side])
-                there = 0
+            # Of the stripe itself, the one before, and the one after; these may not be there.
+            first = ti.Vector([start_in[s]] * 3)
+            last = ti.Vector([start_in[s + 1] - 1, -1, -1])
+            for side in ti.static((1, 2)):
+                other = s + ti.static(2 * side - 3)
                 if other >= 0 and other < stripes:
-                    there = ti.cast(view_in[start_in[other]] == view_in[start_in[s]], ti.i32)
-                base = start_in[ti.max(0, ti.min(other, stripes - 1))]
-                first = base
-                last = -1  # none is there
-                if there == 1:
-                    last = start_in[other + 1] - 1
-                for i in range(start_in[s], start_in[s + 1]):
-                    p = row(point_in, i)
-                    if ti.static(side == 0):
-                        base = i
-                    elif there == 1:
-                        base = _nearest_ahead(p, base, last, point_in)
-                    for k, step in ti.static(
-                        (((0, -1), (1, 1)), ((2, 0), (4, -1), (5, 1)), ((3, 0), (6, -1), (7, 1)))[
-                            side
-                        ]
-                    ):
-                        j = base + step * lag
-                        ring_out[i, k] = i
-                        if j >= first and j <= last:
-                            if (row(point_in, j) - p).norm_sqr() <= gap * gap:
-                                if _row32(normal_in, j).norm_sqr() > 0.25:
-                                    ring_out[i, k] = j
+                    if view_in[start_in[other]] == view_in[start_in[s]]:
+                        first[side] = start_in[other]
+                        last[side] = start_in[other + 1] - 1
+            at = first
+            for i in range(start_in[s], start_in[s + 1]):
+                at[0] = i
+                for side in ti.static((1, 2)):
+                    if last[side] >= 0:
+                        at[side] = _nearest_ahead(row(point_in, i), at[side], last[side], point_in)
+                for k, side, step in ti.static(_RING):
+                    j = at[side] + step * lag
+                    ring_out[i, k] = _linked(
+                        i, j, first[side], last[side], gap, point_in, normal_in
+                    )
 
 
 @ti.kernel
