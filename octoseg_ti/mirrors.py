@@ -45,7 +45,7 @@ def without_mirror_images(
     """
     assert arranged.run is not None
     order = runtime.download(grid.order)
-    gone = _mirrored(grid, leaves, found, arranged.view[order], arranged.run, order, probe)
+    gone = _mirrored(grid, leaves, found, arranged.view.take(order), arranged.run, order, probe)
     if not gone.any():
         return found
     number = np.full(found.count + 1, NONE, np.int32)
@@ -53,11 +53,11 @@ def without_mirror_images(
     number[kept] = np.arange(len(kept), dtype=np.int32)
     return replace(
         found,
-        label=number[found.label],
+        label=number.take(found.label),
         cell_label=number[found.cell_label],
         count=len(kept),
         surface=None if found.surface is None else found.surface[kept],
-        mirrored=np.append(gone, False)[found.label],
+        mirrored=np.append(gone, False).take(found.label),
     )
 
 
@@ -72,10 +72,9 @@ def _mirrored(
 ) -> np.ndarray:
     """Say of every region whether it is a mirror image, shape (K,), bool; ``view`` is sorted."""
     label, regions = found.label, found.count
-    there = np.flatnonzero(label >= 0)
     views = int(view.max()) + 1
-    seen = np.bincount(label[there].astype(np.int64) * views + view[there], None, regions * views)
-    seen = seen.reshape(regions, views)
+    seen = np.bincount((label + 1) * views + view, minlength=(regions + 1) * views)
+    seen = seen.reshape(regions + 1, views)[1:]  # what has no region comes first
     size = seen.sum(axis=1)
     # Nothing larger blocks the largest region.
     asked = (seen.max(axis=1, initial=0) >= _ONE_VIEW * size) & (size < size.max(initial=0))
@@ -83,18 +82,21 @@ def _mirrored(
         return asked
     # Of every region a few points, evenly: leaves are small along its rim, and lines of sight there
     # pass close by what hides the rest of the face.
-    inside = np.flatnonzero(np.append(asked, False)[label])
-    few = [spread(members, _LINES) for members in members_of(label[inside], regions)]
+    inside = np.flatnonzero(np.append(asked, False).take(label))
+    few = [spread(members, _LINES) for members in members_of(label.take(inside), regions)]
     chosen = inside[np.concatenate(few)]
-    chosen = chosen[np.isfinite(probe[run[order[chosen]]]).all(axis=1)]
+    place = probe[run[order[chosen]]]
+    known = np.isfinite(place).all(axis=1)
+    chosen, place = chosen[known], place[known]
     own = label[chosen]
     finest = grid.size / 2.0**grid.depth
     blocked = blocked_lines(
         grid,
-        probe[run[order[chosen]]] - grid.corner,
+        place - grid.corner,
         runtime.download(grid.point)[chosen],
         size[own],
-        np.append(size, 0)[label],
+        label,
+        size,
         clear=_CLEAR * finest,
         reach=_REACH * finest,
     )

@@ -18,8 +18,9 @@ from octoseg_ti.stages.adjacency import Adjacency, find_touching
 from octoseg_ti.stages.assignment import (
     assign_points,
     claimed_share,
+    in_rows,
+    places_of_rows,
     points_of_leaves,
-    to_rows,
 )
 from octoseg_ti.stages.bends import split_at_bends
 from octoseg_ti.stages.grid import Grid
@@ -190,50 +191,47 @@ def assemble(
     params: Params,
 ) -> Segmentation:
     """Number the patches by size, describe their surfaces, and bring all into the input order."""
-    node = runtime.download(grid.node)[: grid.count]
-    patches = found.count
-    n = len(scans)
-    outlier = np.zeros(n, np.uint8)
-    if not arranged.whole:
-        outlier[:] = 1
-        outlier[arranged.row] = 0
+    patches, n = found.count, len(scans)
+    place = places_of_rows(grid, arranged.row, n)
+    outlier = (place < 0).astype(np.uint8)
     left_out = np.flatnonzero(outlier)
     outside = scans_in_world(scans, left_out)
     back = _come_back(outside, grid, found, params)
     size = np.bincount(found.label + 1, minlength=patches + 1)[1:]
-    size += np.bincount(back[back >= 0], minlength=patches)
-    rank = np.argsort(-size, kind="stable")
+    kind, parameters, covariance, residual, surface = _describe(grid, leaves, found, size, measured)
+    rank = np.argsort(-(size + np.bincount(back[back >= 0], minlength=patches)), kind="stable")
     name = np.full(patches + 1, NONE, np.int32)
     name[rank] = np.arange(patches, dtype=np.int32)
-    kind, parameters, covariance, residual, surface = _describe(grid, leaves, found, measured)
-    rows = to_rows(
-        grid, leaves, found.edge, found.label, name[:patches], point, normal, arranged.row,
-        left_out,
-    )  # fmt: skip
-    rows.points[left_out], rows.labels[left_out] = outside, name[back]
+    points, normals = np.empty((n, 3)), np.zeros((n, 3), np.float32)
+    given = slice(None) if arranged.whole else arranged.row
+    points[given], normals[given], points[left_out] = point, normal, outside
+    labels = in_rows(name.take(found.label), place, NONE)
+    labels[left_out] = name[back]
     outlier[left_out[back >= 0]] = 0
-    mean = runtime.download(grid.mean)[leaves]
+    node = runtime.download(grid.node).take(leaves, axis=0)
+    mean = runtime.download(grid.mean).take(leaves, axis=0)
+    level = node[:, LEVEL].astype(np.int8)
     cells = Cells(
-        corner=grid.corner + node[leaves, X : Z + 1] * grid.edge_length[leaves, None],
+        corner=grid.corner + node[:, X : Z + 1] * grid.edge_length[leaves, None],
         size=grid.edge_length[leaves],
-        level=node[leaves, LEVEL].astype(np.int8),
+        level=level,
         count=grid.holds[leaves],
         normal=mean[:, NORMAL : NORMAL + 3].astype(np.float32),
         sigma=mean[:, SIGMA].astype(np.float32),
-        stop=node[leaves, STOP].astype(np.uint8),
+        stop=node[:, STOP].astype(np.uint8),
         edge=found.edge,
         label=name[found.cell_label[leaves]],
         initial_size=grid.size,
     )
-    edge, fillets = rows.edge, None
-    row = arranged.row[runtime.download(grid.order)]
+    edge, fillets = points_of_leaves(grid, leaves, found.edge), None
     if borders is not None:
-        edge, fillets = _fillets(borders, row, n, name, rank)
+        edge, fillets = borders.edge, _fillets(borders, place, name, rank)
     if found.mirrored is not None:
-        outlier[row[found.mirrored]] = 1
+        outlier[in_rows(found.mirrored, place, False)] = 1
     return Segmentation(
-        points=rows.points, normals=rows.normals, labels=rows.labels, edge=edge, fillets=fillets,
-        level=rows.level, outlier=outlier, kind=kind[rank],
+        points=points, normals=normals, labels=labels, edge=in_rows(edge, place, 0),
+        fillets=fillets, level=in_rows(points_of_leaves(grid, leaves, level), place, NONE),
+        outlier=outlier, kind=kind[rank],
         surface=_renumbered(surface[rank]), parameters=parameters[rank],
         covariance=covariance[rank], residual=residual[rank],
         cells=cells, stripe=scans.stripe, view=scans.view, params=params, measured=measured,
@@ -269,43 +267,39 @@ def _come_back(outside: np.ndarray, grid: Grid, found: Regions, params: Params) 
     )  # fmt: skip
 
 
-def _fillets(
-    borders: Borders, row: np.ndarray, rows: int, name: np.ndarray, rank: np.ndarray
-) -> tuple[np.ndarray, Fillets]:
-    """Return the edge class of every row, and the fillets by the number of their points.
+def _fillets(borders: Borders, place: np.ndarray, name: np.ndarray, rank: np.ndarray) -> Fillets:
+    """Return the fillets by the number of their points.
 
     Args:
         borders: The edges of the sorted points.
-        row: Row of every sorted point.
-        rows: Number of rows N.
+        place: Sorted point of every row, -1 = none, shape (N,).
         name: Patch of every region, shape (K + 1,).
         rank: Region of every patch, shape (K,).
     """
-    edge, point = np.zeros(rows, np.uint8), np.full(rows, NONE, np.int32)
-    edge[row] = borders.edge
     size = np.bincount(borders.fillet[borders.fillet >= 0], minlength=len(borders.radius))
     order = np.argsort(-size, kind="stable")
     number = np.full(len(size) + 1, NONE, np.int32)
     number[order] = np.arange(len(size), dtype=np.int32)
-    point[row] = number[borders.fillet]
-    return edge, Fillets(
+    return Fillets(
         patches=np.sort(name[borders.sides[order]], axis=1),
         radius=np.abs(borders.radius[order]),
         deviation=borders.deviation[order],
         concave=(borders.radius[order] > 0.0).astype(np.uint8),
         points=size[order].astype(np.int32),
         strip=number[borders.strip[rank]],
-        point=point,
+        point=in_rows(number.take(borders.fillet), place, NONE),
     )
 
 
 def _describe(
-    grid: Grid, leaves: np.ndarray, found: Regions, measured: Measurement
+    grid: Grid, leaves: np.ndarray, found: Regions, size: np.ndarray, measured: Measurement
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return kind, parameters, their covariance, residual and surface of every region."""
     patches = found.count
     flat = 2.0 * measured.noise + 0.02 * spacing_of(measured)
     cell_label = found.cell_label[leaves]
+    if found.surface is not None:  # what has a surface needs no plane
+        cell_label[np.append(found.surface, NONE)[cell_label] >= 0] = NONE
     kind, parameters, covariance, residual = fit_planes(
         grid, leaves, cell_label, patches, limit=flat
     )
@@ -321,13 +315,11 @@ def _describe(
     covariance[on] = found.covariance[which]
     surface[on] = which
     surface[found.surface < 0] = len(found.kind) + np.arange(patches - len(on))
-    far = distances_to_surfaces(
-        grid.point, np.append(found.surface, NONE)[found.label], found.kind, found.parameters
-    )
+    named = np.append(found.surface, np.int32(NONE)).take(found.label)
+    far = distances_to_surfaces(grid.point, named, found.kind, found.parameters)
     # What has no patch comes first.
-    count = np.maximum(np.bincount(found.label + 1, minlength=patches + 1)[1:], 1)
     square = np.bincount(found.label + 1, far**2, patches + 1)[1:]
-    residual[on] = np.sqrt(square / count)[on]
+    residual[on] = np.sqrt(square / np.maximum(size, 1))[on]
     return kind, parameters, covariance, residual, surface
 
 

@@ -27,7 +27,7 @@ from octoseg_ti.stages.grid import Grid, build_grid
 from octoseg_ti.stages.measure import stripe_noise, stripe_roughness, stripe_spacing
 from octoseg_ti.stages.moments import LEVEL, STOP
 from octoseg_ti.stages.neighbors import PASSES, neighbor_normals
-from octoseg_ti.stages.normals import edge_pair_normals
+from octoseg_ti.stages.normals import edge_pair_sums, oriented_normals
 from octoseg_ti.stages.refinement import refine_poses
 from octoseg_ti.stages.registration import to_world
 from octoseg_ti.stages.scatter import surface_noise
@@ -186,9 +186,9 @@ def estimate_normals(
     points, start, run, view = arranged.points, arranged.start, arranged.run, arranged.view
     chosen = params.normals
     assert chosen.gap is not None
-    how: dict[str, Any] = {"gap": chosen.gap, "rule": chosen.rule, "origin": origin}
     weight = chosen.weight or "unit"
-    normal = edge_pair_normals(points, start, view, weight=weight, **how)
+    sums = edge_pair_sums(points, start, view, gap=chosen.gap, rule=chosen.rule)
+    normal = oriented_normals(sums, points, start, view, weight=weight, origin=origin)
     if chosen.smooth == 0:
         return normal, measured, _with_passes(params, 0)
     noise, tilt = stripe_noise(points, normal, start, run, chosen.gap)
@@ -197,7 +197,8 @@ def estimate_normals(
     assert chosen.gap is not None and chosen.smooth is not None and chosen.weight is not None
     if chosen.smooth > 0:
         if chosen.weight != weight:
-            normal = edge_pair_normals(points, start, view, weight=chosen.weight, **how)
+            how: dict[str, Any] = {"weight": chosen.weight, "origin": origin}
+            normal = oriented_normals(sums, points, start, view, **how)
         lag = square_lag(measured.spacing_along, measured.spacing_across)
         normal = filter_normals(
             points,

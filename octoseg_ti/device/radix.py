@@ -1,8 +1,8 @@
-"""Stable least-significant-digit radix sort of integer keys, and prefix sums of counts.
+"""Stable sort of integer keys: by NumPy where it can be, else by least significant digits.
 
-A pass is: count the digits of every chunk, scan the counts digit by digit over the chunks, move
-every element to its place. The order of equal keys is kept, so the result does not depend on the
-number of threads.
+A pass of the latter is: count the digits of every chunk, scan the counts digit by digit over the
+chunks, move every element to its place. The order of equal keys is kept, so the result does not
+depend on the number of threads.
 """
 
 from typing import Any
@@ -13,6 +13,7 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.runtime import I32Array, I32Rows, I64Array, ti
 
 _MOST_DIGIT_BITS = 12
+_MOST_PACKED_BITS = 63  # of a key and a place in one number
 
 
 @ti.kernel
@@ -82,6 +83,12 @@ def sort_pairs(key: Any, index: Any, bits: int) -> tuple[Any, Any]:
         raise ValueError(f"key and index differ in length: {n} and {index.shape[0]}")
     if n == 0:
         return key, index
+    place_bits = (n - 1).bit_length()
+    if runtime.on_cpu() and bits + place_bits <= _MOST_PACKED_BITS:
+        # With the place in its low bits no key is twice there, so that NumPy's sort, which is not
+        # stable but much faster, does.
+        order = np.sort((key << place_bits) | np.arange(n)) & ((1 << place_bits) - 1)
+        return key.take(order), index.take(order)
     passes = -(-bits // _MOST_DIGIT_BITS)
     digit_bits = -(-bits // passes)
     workers, stride = runtime.workers()

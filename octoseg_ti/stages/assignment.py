@@ -4,223 +4,170 @@ A point of an edge cell looks at the labelled cells around it and joins the one 
 lies on. It looks one smallest cell away, then two, then three: an edge band is a cell or two wide.
 """
 
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row, vec3
-from octoseg_ti.device.runtime import F32Rows, F64Rows, I32Array, I32Rows, ti
+from octoseg_ti.device.morton import compacted
+from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, I64Array, ti
 from octoseg_ti.stages.grid import Grid, find_node
 from octoseg_ti.stages.moments import LEVEL, POINT
 from octoseg_ti.types import NONE
 
 _ROUNDS = 3
+_ASKED = -2  # the label of points for which one is looked for
+_BEND = -2  # the label of cells that have none and lie on a bend
+
+ivec3: Any = ti.types.vector(3, ti.i32)
+ivec4: Any = ti.types.vector(4, ti.i32)
+near_cells: Any = ti.types.vector(27, ti.i32)
 
 
 @ti.func
-def _better(best: ti.template(), k: ti.i32, off: ti.f64, far: ti.f64, label: ti.f64) -> ti.i32:
-    """Say whether a cell suits better: nearer plane, then nearer middle, then smaller label."""
-    better = off < best[k, 0]
-    if off == best[k, 0]:
-        better = far < best[k, 1]
-        if far == best[k, 1]:
-            better = label < best[k, 2]
-    return ti.cast(better, ti.i32)
+def _collect(
+    at: ivec3,
+    level: ti.i32,
+    reach: ti.i32,
+    boxes: ivec4,
+    root: ti.template(),
+    child: ti.template(),
+    cell_label: ti.template(),
+    near: ti.template(),
+) -> ti.i32:
+    """List the cells with a label that hold the 27 smallest boxes at a distance, and count them.
+
+    The cell of the box itself, so many levels above it, has none.
+    """
+    shape = ivec3(boxes[0], boxes[1], boxes[2])
+    count = 0
+    before = -1
+    for o in range(27):
+        box = at + reach * ivec3(o // 9 - 1, (o // 3) % 3 - 1, o % 3 - 1)
+        if ((box ^ at) >> level).any():
+            c = find_node(box[0], box[1], box[2], boxes[3], shape, boxes[3], root, child)
+            if c >= 0 and c != before:
+                if cell_label[c] >= 0:
+                    near[count] = c
+                    count += 1
+            before = c
+    return count
+
+
+@ti.func
+def _choose(
+    p: vec3,
+    bend: ti.i32,
+    rule: vec3,
+    count: ti.i32,
+    near: ti.template(),
+    mean: ti.template(),
+    cell_label: ti.template(),
+) -> ti.i32:
+    """Return the label of the cell whose mean plane is nearest to a point, -1 if none is near.
+
+    Ties go to the nearer cell, then to the smaller label, never to the order of the points.
+    """
+    best_off, best_far, best = ti.math.inf, ti.math.inf, -1
+    for k in range(count):
+        c = near[k]
+        normal = row(mean, c)
+        limit = rule[0]
+        if bend >= 0:  # nested: `and` would read the row of node -1
+            if ti.abs(row(mean, bend).dot(normal)) < rule[2]:
+                limit = rule[1]
+        d = p - vec3(mean[c, POINT], mean[c, POINT + 1], mean[c, POINT + 2])
+        off = ti.abs(d.dot(normal))
+        if off <= limit and off <= best_off:
+            far = d.norm_sqr()
+            nearer = far < best_far or (far == best_far and cell_label[c] < best)
+            if off < best_off or nearer:
+                best_off, best_far, best = off, far, cell_label[c]
+    return best
 
 
 @ti.kernel
 def _join(
-    reach: ti.i32,
-    rule: ti.types.vector(3, ti.f64),
-    finest: ti.f64,
-    depth: ti.i32,
-    shape: ti.types.vector(3, ti.i32),
+    rounds: ti.i32,
+    rule: vec3,
+    boxes: ivec4,
     # In:
+    key_in: I64Array,
     point_in: F64Rows,
+    node_in: I32Rows,
     child_in: I32Rows,
     root_in: I32Array,
     mean_in: F64Rows,
     cell_label_in: I32Array,
-    run_in: I32Rows,
     # Out:
-    best_inout: F64Rows,
+    label_inout: I32Array,
 ):
-    """Find, for runs of points in one box, the nearest mean plane among the cells at a distance.
+    """Label the points that are asked for, run by run of points in one smallest box.
 
     The rule holds the largest distance from the plane, that distance on a bend where the normals
-    differ, and the cosine from which they do not. Ties go to the nearer cell, then to the smaller
-    label, never to the order of the points.
+    differ, and the cosine from which they do not.
     """
-    for u in range(run_in.shape[0]):
-        lo = run_in[u, 0]
-        hi = run_in[u, 1]
-        bend = run_in[u, 2]
-        x = ti.min(ti.cast(point_in[lo, 0] * finest, ti.i32), (shape[0] << depth) - 1)
-        y = ti.min(ti.cast(point_in[lo, 1] * finest, ti.i32), (shape[1] << depth) - 1)
-        z = ti.min(ti.cast(point_in[lo, 2] * finest, ti.i32), (shape[2] << depth) - 1)
-        before = -1
-        for o in range(27):
-            c = find_node(
-                x + reach * (o // 9 - 1),
-                y + reach * ((o // 3) % 3 - 1),
-                z + reach * (o % 3 - 1),
-                depth,
-                shape,
-                depth,
-                root_in,
-                child_in,
-            )
-            if c >= 0 and c != before and cell_label_in[c] >= 0:
-                label = ti.cast(cell_label_in[c], ti.f64)
-                normal = row(mean_in, c)
-                middle = vec3(mean_in[c, POINT], mean_in[c, POINT + 1], mean_in[c, POINT + 2])
-                limit = rule[0]
-                if bend >= 0:  # nested: `and` would read the row of node -1
-                    if ti.abs(row(mean_in, bend).dot(normal)) < rule[2]:
-                        limit = rule[1]
-                for i in range(lo, hi):
-                    k = run_in[u, 3] + i - lo
-                    d = row(point_in, i) - middle
-                    off = ti.abs(d.dot(normal))
-                    far = d.norm_sqr()
-                    if off <= limit and _better(best_inout, k, off, far, label) == 1:
-                        best_inout[k, 0] = off
-                        best_inout[k, 1] = far
-                        best_inout[k, 2] = label
-            before = c
+    for i in label_inout:
+        # Only the first point of a run looks at labels: nobody else writes those of its run.
+        if i == 0 or key_in[i] != key_in[ti.max(0, i - 1)]:
+            if label_inout[i] == _ASKED:
+                key = key_in[i]
+                at = ivec3(compacted(key, 0), compacted(key, 1), compacted(key, 2))
+                shape = ivec3(boxes[0], boxes[1], boxes[2])
+                own = find_node(at[0], at[1], at[2], boxes[3], shape, boxes[3], root_in, child_in)
+                level = boxes[3] - node_in[own, LEVEL]
+                bend = ti.select(cell_label_in[own] == _BEND, own, -1)
+                near = near_cells(-1)
+                left = 1
+                reach = 1
+                while left > 0:
+                    left = 0
+                    count = _collect(
+                        at, level, reach, boxes, root_in, child_in, cell_label_in, near
+                    )
+                    j = i
+                    while j >= 0:
+                        if label_inout[j] == _ASKED:
+                            p = row(point_in, j)
+                            found = _choose(p, bend, rule, count, near, mean_in, cell_label_in)
+                            if found >= 0 or reach == rounds:
+                                label_inout[j] = found
+                            else:
+                                left += 1
+                        j += 1
+                        if j == label_inout.shape[0]:
+                            j = -1
+                        elif key_in[j] != key_in[i]:
+                            j = -1
+                    reach += 1
 
 
-def _runs(grid: Grid, index: np.ndarray, bend: np.ndarray | None) -> np.ndarray:
-    """Return the runs of points that lie in one smallest box.
+def places_of_rows(grid: Grid, row: np.ndarray, rows: int) -> np.ndarray:
+    """Return the sorted point of every row of the input, -1 for rows of no point; shape (N,).
 
     Args:
         grid: The sparse grid.
-        index: Sorted points in question, ascending, shape (q,).
-        bend: Node of the bend that each of them is on, -1 = none, shape (q,); None = none at all.
-
-    Returns:
-        First point, end, bend, and place of the first point in ``index``, shape (r, 4), i32.
+        row: Input row of every one of its points, as they were given, shape (n,).
+        rows: Number of rows N.
     """
-    box = runtime.download(grid.key)[index]
-    new = np.ones(len(index), bool)
-    new[1:] = (index[1:] - index[:-1] > 1) | (box[1:] != box[:-1])
-    first = np.flatnonzero(new)
-    last = np.append(first[1:], len(index)) - 1
-    runs = np.empty((len(first), 4), np.int32)
-    runs[:, 0], runs[:, 1], runs[:, 3] = index[first], index[last] + 1, first
-    runs[:, 2] = NONE if bend is None else bend[first]
-    return runs
+    place = np.full(rows, NONE, np.intp)
+    place[row.take(runtime.download(grid.order))] = np.arange(len(row))
+    return place
 
 
-@ti.kernel
-def _scatter(
-    # In:
-    order_in: I32Array,
-    row_in: I32Array,
-    leaf_in: I32Rows,
-    label_in: I32Array,
-    name_in: I32Array,
-    point_in: F64Rows,
-    normal_in: F64Rows,
-    # Out:
-    label_out: I32Array,
-    level_out: I32Array,
-    edge_out: I32Array,
-    point_out: F64Rows,
-    normal_out: F32Rows,
-):
-    """Write label, level and edge class, position and normal of all points to their rows."""
-    for c in range(leaf_in.shape[0]):
-        for i in range(leaf_in[c, 0], leaf_in[c, 1]):
-            r = row_in[order_in[i]]
-            label = label_in[i]
-            label_out[r] = name_in[label] if label >= 0 else -1
-            level_out[r] = leaf_in[c, 2]
-            edge_out[r] = leaf_in[c, 3]
-    for i in row_in:
-        r = row_in[i]
-        for k in ti.static(range(3)):
-            point_out[r, k] = point_in[i, k]
-            normal_out[r, k] = ti.cast(normal_in[i, k], ti.f32)
-
-
-class Rows(NamedTuple):
-    """What is known of every row of the input; ``N`` rows."""
-
-    points: np.ndarray
-    """Positions [mm], shape (N, 3), f64; NaN for rows of no point."""
-    normals: np.ndarray
-    """Unit normals, shape (N, 3), f32; zero for rows of no point."""
-    labels: np.ndarray
-    """Patches, shape (N,), i32; -1 = none."""
-    level: np.ndarray
-    """Levels, shape (N,), i8; -1 = in no cell."""
-    edge: np.ndarray
-    """`EdgeClass`, shape (N,), u8."""
-
-
-def to_rows(
-    grid: Grid,
-    leaves: np.ndarray,
-    edge: np.ndarray,
-    label: np.ndarray,
-    name: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    row: np.ndarray,
-    left_out: np.ndarray,
-) -> Rows:
-    """Bring what is known of the points into the order of the input.
+def in_rows(values: np.ndarray, place: np.ndarray, missing: int) -> np.ndarray:
+    """Bring a value of every sorted point to the rows of the input.
 
     Args:
-        grid: The sparse grid.
-        leaves: The nodes that are leaves, in Morton order, shape (C,).
-        edge: `EdgeClass` of every leaf, shape (C,).
-        label: Label of every sorted point, shape (n,), i32.
-        name: New name of every label, shape (K,), i32.
-        points: Positions of the points of the grid as they were given [mm], shape (n, 3), f64.
-        normals: Their unit normals, shape (n, 3), f64.
-        row: Input row of every one of these points, shape (n,), i64.
-        left_out: The other rows of the input, shape (N - n,), i64.
+        values: The values, shape (n,).
+        place: Sorted point of every row, -1 = none (`places_of_rows`), shape (N,).
+        missing: Value of the rows of no point.
 
     Returns:
-        The rows.
+        A value of every row, shape (N,), of the same type.
     """
-    runtime.ensure_started()
-    leaf = np.empty((len(leaves), 4), np.int32)
-    leaf[:, 0] = grid.first[leaves]
-    leaf[:, 1] = leaf[:, 0] + grid.holds[leaves]
-    leaf[:, 2] = runtime.download(grid.node)[leaves, LEVEL]
-    leaf[:, 3] = edge
-    rows = len(row) + len(left_out)
-    labels, levels, edges = (runtime.empty(rows, np.int32) for _ in range(3))
-    placed = runtime.empty((rows, 3), np.float64)
-    turned = runtime.empty((rows, 3), np.float32)
-    _scatter(
-        grid.order,
-        runtime.upload(row.astype(np.int32)),
-        runtime.upload(leaf),
-        runtime.upload(label),
-        runtime.upload(name if len(name) else np.full(1, NONE, np.int32)),
-        runtime.upload(points),
-        runtime.upload(normals),
-        labels,
-        levels,
-        edges,
-        placed,
-        turned,
-    )
-    found = Rows(
-        points=runtime.download(placed),
-        normals=runtime.download(turned),
-        labels=runtime.download(labels),
-        level=runtime.download(levels).astype(np.int8),
-        edge=runtime.download(edges).astype(np.uint8),
-    )
-    for array, value in zip(found, (np.nan, 0.0, NONE, -1, 0), strict=True):
-        array[left_out] = value
-    return found
+    return np.append(values, values.dtype.type(missing)).take(place)
 
 
 def points_of_leaves(grid: Grid, leaves: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -235,14 +182,6 @@ def points_of_leaves(grid: Grid, leaves: np.ndarray, values: np.ndarray) -> np.n
         The value of every sorted point, shape (n,).
     """
     return np.repeat(values, grid.holds[leaves])
-
-
-def points_in(grid: Grid, cells: np.ndarray) -> np.ndarray:
-    """Return the sorted points in some cells, cell after cell, i32."""
-    holds = grid.holds[cells]
-    ends = np.cumsum(holds, dtype=np.int32)
-    offset = grid.first[cells] - (ends - holds)
-    return np.arange(holds.sum(), dtype=np.int32) + np.repeat(offset, holds)
 
 
 def assign_points(
@@ -278,42 +217,27 @@ def assign_points(
         Label of every sorted point, -1 where no patch fits, shape (n,), i32.
     """
     runtime.ensure_started()
-    label = np.ascontiguousarray(points_of_leaves(grid, leaves, cell_label[leaves]), np.int32)
-    if not np.any(cell_label >= 0):
-        return label
-    asked = cell_label[leaves] < 0
+    label = cell_label[leaves]
+    if not np.any(label >= 0):
+        return points_of_leaves(grid, leaves, label)
+    asked = label < 0
     if only is not None:
         asked &= only[leaves]
-    asked = leaves[asked]
-    index = points_in(grid, asked)
-    on_bend = None
-    if bend.any():
-        on_bend = np.repeat(np.where(bend[asked], asked, NONE).astype(np.int32), grid.holds[asked])
-    device_cell = runtime.upload(cell_label.astype(np.int32))
-    for r in range(1, rounds + 1):
-        if len(index) == 0:
-            break
-        best = runtime.upload(np.full((len(index), 3), np.inf))
-        _join(
-            r,
-            (limit, tight, float(np.cos(angle))),
-            2.0**grid.depth / grid.size,
-            grid.depth,
-            grid.shape,
-            grid.point,
-            grid.child,
-            grid.root,
-            grid.mean,
-            device_cell,
-            runtime.upload(_runs(grid, index, on_bend)),
-            best,
-        )
-        name = runtime.download(best)[:, 2]
-        found = np.isfinite(name)
-        label[index[found]] = name[found].astype(np.int32)
-        index = index[~found]
-        on_bend = None if on_bend is None else on_bend[~found]
-    return label
+    label = runtime.upload(points_of_leaves(grid, leaves, np.where(asked, np.int32(_ASKED), label)))
+    _join(
+        rounds,
+        (limit, tight, float(np.cos(angle))),
+        (*grid.shape, grid.depth),
+        grid.key,
+        grid.point,
+        grid.node,
+        grid.child,
+        grid.root,
+        grid.mean,
+        runtime.upload(np.where(bend & (cell_label < 0), np.int32(_BEND), cell_label)),
+        label,
+    )
+    return runtime.download(label)
 
 
 def claimed_share(
@@ -330,13 +254,9 @@ def claimed_share(
     Returns:
         Share of labelled points, 0 for an empty group, shape (G,), f64.
     """
-    groups = int(group.max(initial=NONE)) + 1
-    inside = leaves[group[leaves] >= 0]
-    if len(inside) == 0:
-        return np.zeros(groups)
-    count = grid.holds[inside]
-    begin = np.cumsum(count) - count
-    labelled = np.add.reduceat((label[points_in(grid, inside)] >= 0).astype(np.int32), begin)
-    total = np.bincount(group[inside], weights=count, minlength=groups)
-    found = np.bincount(group[inside], weights=labelled, minlength=groups)
+    named = group[leaves] + 1
+    groups = int(named.max(initial=0))
+    labelled = np.add.reduceat((label >= 0).astype(np.int32), grid.first[leaves])
+    total = np.bincount(named, weights=grid.holds[leaves], minlength=groups + 1)[1:]
+    found = np.bincount(named, weights=labelled, minlength=groups + 1)[1:]
     return found / np.maximum(total, 1)

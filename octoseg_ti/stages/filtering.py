@@ -18,7 +18,7 @@ import math
 import numpy as np
 
 from octoseg_ti.device import runtime
-from octoseg_ti.device.linalg import row
+from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.runtime import F32Array, F32Rows, F64Rows, I32Array, I32Rows, ti
 from octoseg_ti.stages.sampling import sample_stripes, trimmed_mean
 
@@ -34,7 +34,11 @@ _OPENING = 2
 _SPREAD_NOISES = 4.0
 _SPREAD_CURVED = 4.0
 _SAMPLES = 6000
-_NONE = -1
+# The neighbours by number, the diagonal ones last: on which stripe, 0 for that of the point, 1 for
+# the one before, 2 for the one after, and how many steps from the nearest point there.
+_RING = (
+    (0, 0, -1), (1, 0, 1), (2, 1, 0), (3, 2, 0), (4, 1, -1), (5, 1, 1), (6, 2, -1), (7, 2, 1)
+)  # fmt: skip
 
 _vec3_f32 = ti.types.vector(3, ti.f32)
 
@@ -56,90 +60,83 @@ def _write_direction(total, before, i: ti.i32, normal_out: ti.template()):
         normal_out[i, k] = n[k]
 
 
-@ti.kernel
-def _find_partners(
-    stripes: ti.i32,
-    stride: ti.i32,
-    # In:
-    point_in: F64Rows,
-    start_in: I32Array,
-    view_in: I32Array,
-    # Out:
-    partner_out: I32Rows,
-):
-    """Write the nearest point on the stripe before and on the one after, -1 where there is none.
+@ti.func
+def _nearest_ahead(p: vec3, j: ti.i32, last: ti.i32, point: ti.template()) -> ti.i32:
+    """Return the point of a stripe that is nearest to p, going on from j.
 
-    Both are found by going along, for neighbouring stripes run the same way; looking two points
-    ahead gets over noise.
+    Looking two points ahead gets over noise.
     """
-    for u in range(stripes * stride):
-        s = u // stride
-        if u % stride == 0:
-            for side in ti.static(range(2)):
-                other = s - 1 + 2 * side
-                last = -1
-                j = 0
-                if other >= 0 and other < stripes:
-                    if view_in[start_in[other]] == view_in[start_in[s]]:
-                        j = start_in[other]
-                        last = start_in[other + 1] - 1
-                for i in range(start_in[s], start_in[s + 1]):
-                    if last < 0:
-                        partner_out[i, side] = _NONE
-                    else:
-                        p = row(point_in, i)
-                        best = (row(point_in, j) - p).norm_sqr()
-                        going = 1
-                        while going == 1:
-                            going = 0
-                            for ahead in ti.static((1, 2)):
-                                k = ti.min(j + ahead, last)
-                                d = (row(point_in, k) - p).norm_sqr()
-                                if going == 0 and k > j and d <= best:
-                                    best = d
-                                    j = k
-                                    going = 1
-                        partner_out[i, side] = j
+    at = j
+    best = (row(point, at) - p).norm_sqr()
+    going = 1
+    while going == 1:
+        going = 0
+        for ahead in ti.static((1, 2)):
+            if going == 0 and at + ahead <= last:
+                d = (row(point, at + ahead) - p).norm_sqr()
+                if d <= best:
+                    best = d
+                    at += ahead
+                    going = 1
+    return at
+
+
+@ti.func
+def _linked(
+    i: ti.i32, j: ti.i32, first: ti.i32, last: ti.i32, gap: ti.f64, point: ti.template(),
+    normal: ti.template(),
+) -> ti.i32:  # fmt: skip
+    """Return j if it is one of its stripe, near to i and with a normal; else i."""
+    found = i
+    if j >= first and j <= last:
+        if (row(point, j) - row(point, i)).norm_sqr() <= gap * gap:
+            if _row32(normal, j).norm_sqr() > 0.25:
+                found = j
+    return found
 
 
 @ti.kernel
 def _link(
     lag: ti.i32,
+    stripes: ti.i32,
+    stride: ti.i32,
     gap: ti.f64,
     # In:
     point_in: F64Rows,
     normal_in: F32Rows,
     start_in: I32Array,
-    run_in: I32Array,
-    partner_in: I32Rows,
+    view_in: I32Array,
     # Out:
     ring_out: I32Rows,
 ):
     """Write the eight neighbours of every point; itself where one is missing.
 
-    Two on its own stripe, the two partners, and two beside each partner.
+    Two on its own stripe, the nearest points of the stripes before and after, and two beside each
+    of these. The nearest are found by going along, for neighbouring stripes run the same way.
     """
-    for i in run_in:
-        p = row(point_in, i)
-        found = ti.Vector([i] * 8)
-        for side in ti.static(range(3)):
-            base = i
-            if ti.static(side > 0):
-                base = partner_in[i, side - 1]
-            if base >= 0:
-                s = run_in[base]
-                first = start_in[s]
-                stop = start_in[s + 1]
-                for k, step in ti.static(
-                    (((0, -1), (1, 1)), ((2, 0), (4, -1), (5, 1)), ((3, 0), (6, -1), (7, 1)))[side]
-                ):
-                    j = base + step * lag
-                    if j >= first and j < stop:
-                        if (row(point_in, j) - p).norm_sqr() <= gap * gap:
-                            if _row32(normal_in, j).norm_sqr() > 0.25:
-                                found[k] = j
-        for k in ti.static(range(8)):
-            ring_out[i, k] = found[k]
+    for u in range(stripes * stride):
+        s = u // stride
+        if u % stride == 0:
+            # Of the stripe itself, the one before, and the one after; these may not be there.
+            first = ti.Vector([start_in[s]] * 3)
+            last = ti.Vector([start_in[s + 1] - 1, -1, -1])
+            for side in ti.static((1, 2)):
+                other = s + ti.static(2 * side - 3)
+                if other >= 0 and other < stripes:
+                    if view_in[start_in[other]] == view_in[start_in[s]]:
+                        first[side] = start_in[other]
+                        last[side] = start_in[other + 1] - 1
+            at = first
+            for i in range(start_in[s], start_in[s + 1]):
+                at[0] = i
+                for side in ti.static((1, 2)):
+                    if last[side] >= 0:
+                        at[side] = _nearest_ahead(row(point_in, i), at[side], last[side], point_in)
+                for k, side, step in ti.static(_RING):
+                    j = at[side] + step * lag
+                    ring_out[i, k] = _linked(
+                        i, j, first[side], last[side], gap, point_in, normal_in
+                    )
 
 
 @ti.kernel
@@ -255,16 +252,17 @@ def _weigh(
 def _finish(
     # In:
     filtered_in: F32Rows,
-    run_in: I32Array,
+    normal_in: F64Rows,
     # Out:
-    normal_inout: F64Rows,
+    normal_out: F64Rows,
 ):
     """Write the filtered normals in full length where there was a normal."""
-    for i in run_in:
-        if row(normal_inout, i).norm_sqr() > 0.25:
+    for i in range(normal_in.shape[0]):
+        n = row(normal_in, i)
+        if n.norm_sqr() > 0.25:
             n = row(filtered_in, i).normalized()
-            for k in ti.static(range(3)):
-                normal_inout[i, k] = n[k]
+        for k in ti.static(range(3)):
+            normal_out[i, k] = n[k]
 
 
 def square_lag(along: float, across: float) -> int:
@@ -326,16 +324,15 @@ def filter_normals(
         return normals
     runtime.ensure_started()
     n, stripes = len(points), len(start) - 1
-    point, starts, runs = runtime.upload(points), runtime.upload(start), runtime.upload(run)
-    partner, ring = runtime.empty((n, 2), np.int32), runtime.empty((n, 8), np.int32)
+    point, starts, seen = runtime.upload(points), runtime.upload(start), runtime.upload(view)
+    ring = runtime.empty((n, 8), np.int32)
     _, stride = runtime.workers()
-    _find_partners(stripes, stride, point, starts, runtime.upload(view), partner)
     raw = runtime.upload(normals.astype(np.float32))
     old, new, spare = raw, *(runtime.empty((n, 3), np.float32) for _ in range(2))
     # Dense stripes: means over one, two, four ... points first, until the steps are square.
     step = 1
     while True:
-        _link(step, gap, point, raw, starts, runs, partner, ring)
+        _link(step, stripes, stride, gap, point, raw, starts, seen, ring)
         _average_near(1.0 / (_GATE * max(noise, 1e-6)) ** 2, ring, old, new)
         old, new, spare = new, spare, new
         if step >= lag:
@@ -355,6 +352,6 @@ def filter_normals(
         _weigh(max(nothing, 1e-12), spread, curved, weight)
         _average(ring, old, weight, new)
         old, new = new, old
-    result = runtime.upload(normals.copy())
-    _finish(old, runs, result)
+    result = runtime.empty((n, 3), np.float64)
+    _finish(old, runtime.upload(normals), result)
     return runtime.download(result)

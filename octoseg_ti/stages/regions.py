@@ -176,13 +176,12 @@ def number_groups(grid: Grid, group: np.ndarray, min_points: int) -> np.ndarray:
     names = names[np.argsort(-size[names], kind="stable")]
     label = np.full(grid.count + 1, NONE, np.int32)
     label[names] = np.arange(len(names), dtype=np.int32)
-    return label[np.where(group >= 0, group, grid.count)]
+    return label[group]
 
 
 def group_sizes(grid: Grid, group: np.ndarray) -> np.ndarray:
     """Return the points of every group, by its name, shape (M,), f64 (whole numbers)."""
-    inside = group >= 0
-    return np.bincount(group[inside], weights=grid.holds[inside], minlength=grid.count)
+    return np.bincount(group + 1, weights=grid.holds, minlength=grid.count + 1)[1:]
 
 
 def strips(grid: Grid, touching: Adjacency, group: np.ndarray) -> np.ndarray:

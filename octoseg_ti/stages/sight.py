@@ -52,23 +52,24 @@ def _follow(
     boxes: ivec4,
     # In:
     line_in: F64Rows,
-    least_in: I32Array,
     root_in: I32Array,
     child_in: I32Rows,
     node_in: I32Rows,
     mean_in: F64Rows,
     point_in: F64Rows,
     normal_in: F64Rows,
+    label_in: I32Array,
     weight_in: I32Array,
     # Out:
     blocked_out: I32Array,
 ):
-    """Write whether a point that weighs more than the least blocks a line.
+    """Write whether a point whose label weighs more than the least blocks a line.
 
+    A line holds its start, its end, and that least weight; the first weight is that of no label.
     The rule holds the size of the smallest cells, the length at the end that is left out, and the
     reach of a point. Of a large cell only what lies near its mean plane is looked at.
     """
-    for a in least_in:
+    for a in blocked_out:
         finest, reach, depth = rule[0], rule[2], boxes[3]
         shape = ti.Vector([boxes[0], boxes[1], boxes[2]])
         start = vec3(line_in[a, 0], line_in[a, 1], line_in[a, 2])
@@ -90,7 +91,7 @@ def _follow(
                 if ti.abs((p - middle).dot(row(mean_in, c))) <= step + reach:
                     i = node_in[c, LO]
                     while i < node_in[c, HI] and blocked == 0:
-                        if weight_in[i] > least_in[a]:
+                        if weight_in[label_in[i] + 1] > line_in[a, 6]:
                             blocked = _through(
                                 start, way, last, reach, row(point_in, i), row(normal_in, i)
                             )
@@ -104,6 +105,7 @@ def blocked_lines(
     origin: np.ndarray,
     point: np.ndarray,
     least: np.ndarray,
+    label: np.ndarray,
     weight: np.ndarray,
     *,
     clear: float,
@@ -115,8 +117,9 @@ def blocked_lines(
         grid: The sparse grid.
         origin: Where every line starts, relative to the corner of the grid [mm], shape (A, 3), f64.
         point: Where it ends, shape (A, 3), f64.
-        least: Only points that weigh more than this block it, shape (A,), i32.
-        weight: Weight of every sorted point, shape (n,), i32.
+        least: Only points whose label weighs more than this block it, shape (A,).
+        label: Label of every sorted point, 0..K-1, -1 = none, shape (n,), i32.
+        weight: Weight of every label, shape (K,); points without one weigh nothing.
         clear: What is nearer to the end of a line does not block it [mm].
         reach: A point stands for the surface around it, so far [mm].
 
@@ -130,15 +133,15 @@ def blocked_lines(
     _follow(
         vec3(grid.size / 2.0**grid.depth, clear, reach),
         ivec4(*grid.shape, grid.depth),
-        runtime.upload(np.concatenate([origin, point], axis=1)),
-        runtime.upload(least.astype(np.int32)),
+        runtime.upload(np.column_stack([origin, point, least.astype(np.float64)])),
         grid.root,
         grid.child,
         grid.node,
         grid.mean,
         grid.point,
         grid.normal,
-        runtime.upload(weight.astype(np.int32)),
+        runtime.upload(label),
+        runtime.upload(np.append(0, weight).astype(np.int32)),
         blocked,
     )
     return runtime.download(blocked) > 0

@@ -1,4 +1,6 @@
-"""The radix sort is numpy's stable sort, for any number of keys, bits and threads' chunks."""
+"""The sort of keys is numpy's stable sort, for any number of keys, bits and threads' chunks."""
+
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -19,9 +21,12 @@ def check(key: np.ndarray, bits: int, seed: int) -> None:
     order = np.argsort(key, kind="stable")
     index = np.random.default_rng(seed + 1).permutation(len(key)).astype(np.int32)
     runtime.ensure_started()
-    out_key, out_index = sorted_pairs(key, index, bits)
-    np.testing.assert_array_equal(out_key, key[order], err_msg=f"seed {seed}, {bits} bits")
-    np.testing.assert_array_equal(out_index, index[order], err_msg=f"seed {seed}, {bits} bits")
+    for packed in (63, 0):  # by NumPy where it can be, and by digits
+        with patch.object(radix, "_MOST_PACKED_BITS", packed):
+            out_key, out_index = sorted_pairs(key, index, bits)
+        what = f"seed {seed}, {bits} bits, {packed} packed"
+        np.testing.assert_array_equal(out_key, key[order], err_msg=what)
+        np.testing.assert_array_equal(out_index, index[order], err_msg=what)
 
 
 @settings(max_examples=60, deadline=None)

@@ -19,12 +19,14 @@ def test_equals_the_reference(seed: int) -> None:
     grid = build_grid(points, normals, tolerance=0.2, min_cell=0.4, min_points=3)
     node, _, mean = tables(grid)
     leaves = leaf_nodes(grid)
-    weight = rng.integers(0, 4, len(points)).astype(np.int32)
+    label = rng.integers(-1, 4, len(points)).astype(np.int32)
+    weight = np.array([1, 0, 2, 3])
+    heavy = np.append(weight, 0)[label]
     high = np.array(grid.shape) * grid.size
     start = rng.uniform(-2.0, 3.0, (80, 3)) * high
     end = rng.uniform(0.0, 1.0, (80, 3)) * high
-    least = rng.integers(0, 3, 80).astype(np.int32)
-    got = blocked_lines(grid, start, end, least, weight, clear=0.3, reach=0.4)
+    least = rng.integers(0, 4, 80).astype(np.int32)
+    got = blocked_lines(grid, start, end, least, label, weight, clear=0.3, reach=0.4)
     side = grid.size / 2.0 ** node[:, LEVEL]
     leaves = [
         (
@@ -36,7 +38,7 @@ def test_equals_the_reference(seed: int) -> None:
     box = (high, grid.size / 2.0**grid.depth)
     sorted_points = (runtime.download(grid.point), runtime.download(grid.normal))
     expected = [
-        plain.blocked(leaves, *sorted_points, weight > least[i], (start[i], end[i]), box, 0.3, 0.4)
+        plain.blocked(leaves, *sorted_points, heavy > least[i], (start[i], end[i]), box, 0.3, 0.4)
         for i in range(80)
     ]
     np.testing.assert_array_equal(got, expected)
@@ -44,7 +46,7 @@ def test_equals_the_reference(seed: int) -> None:
 
 
 def floors() -> tuple[Grid, np.ndarray]:
-    """Return a floor at z = 5 with a hole, and half of it at z = 0; points weigh 2 and 1."""
+    """Return a floor at z = 5 with a hole, and half of it at z = 0; labels 1 and 0."""
     x, y = np.meshgrid(np.arange(0.0, 20.0, 0.25), np.arange(0.0, 20.0, 0.25))
     upper = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 5.0)])
     lower = upper[upper[:, 0] < 10.0] * [1.0, 1.0, 0.0]
@@ -53,14 +55,15 @@ def floors() -> tuple[Grid, np.ndarray]:
     normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     grid = build_grid(points, normals, tolerance=0.03, min_cell=0.5, min_points=3, flatness=0.25)
     high = runtime.download(grid.point)[:, 2] + grid.corner[2] > 2.5
-    return grid, np.where(high, 2, 1).astype(np.int32)
+    return grid, high.astype(np.int32)
 
 
 def through(start: list[float], end: list[float], least: int, clear: float = 0.5) -> bool:
     """Say whether a line among the floors is blocked."""
-    grid, weight = floors()
+    grid, label = floors()
     ends = [np.array([place]) - grid.corner for place in (start, end)]
-    return bool(blocked_lines(grid, *ends, np.array([least]), weight, clear=clear, reach=0.25)[0])
+    weights = (np.array([least]), label, np.array([1, 2]))
+    return bool(blocked_lines(grid, *ends, *weights, clear=clear, reach=0.25)[0])
 
 
 def test_a_floor_above_blocks() -> None:
@@ -94,7 +97,8 @@ def test_a_line_beside_the_floor_is_free_and_a_grazing_one_is_let_pass() -> None
 
 
 def test_no_lines_have_no_answers() -> None:
-    grid, weight = floors()
+    grid, label = floors()
     none = np.zeros((0, 3))
-    got = blocked_lines(grid, none, none, np.zeros(0, int), weight, clear=1.0, reach=1.0)
+    weights = (np.zeros(0, int), label, np.array([1, 2]))
+    got = blocked_lines(grid, none, none, *weights, clear=1.0, reach=1.0)
     assert got.shape == (0,)
