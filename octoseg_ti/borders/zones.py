@@ -239,7 +239,7 @@ class Search:
         cap = self.coarse()
         sharp = self.sums(task, _shapes(np.zeros(1), hollow), point, cap)[:, 0, 0]
         cost = self.sums(task, _shapes(radii, hollow), point, cap, sharp)[..., 0]
-        gain = (sharp - cost.min(axis=1)) / cap**2 * (cap / self.noise) ** 2
+        gain = (sharp - cost.min(axis=1)) / self.noise**2
         return radii[cost.argmin(axis=1)], gain
 
 
