@@ -256,6 +256,8 @@ def claimed_share(
     """
     named = group[leaves] + 1
     groups = int(named.max(initial=0))
+    if groups == 0:
+        return np.zeros(0)
     labelled = np.add.reduceat((label >= 0).astype(np.int32), grid.first[leaves])
     total = np.bincount(named, weights=grid.holds[leaves], minlength=groups + 1)[1:]
     found = np.bincount(named, weights=labelled, minlength=groups + 1)[1:]

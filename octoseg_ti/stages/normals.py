@@ -16,7 +16,7 @@ from octoseg_ti.device.runtime import F64Rows, I32Array, ti
 WEIGHTS = ("unit", "area")
 """How the normals of triangles can be weighed, in the order of their sums."""
 
-vec6 = ti.types.vector(6, ti.f64)
+vec6: Any = ti.types.vector(6, ti.f64)
 
 
 @ti.func
@@ -263,18 +263,3 @@ def oriented_normals(
     if np.any(sign < 0):
         _flip(seen, runtime.upload(sign), normal)
     return runtime.download(normal)
-
-
-def edge_pair_normals(
-    points: np.ndarray,
-    start: np.ndarray,
-    view: np.ndarray,
-    *,
-    gap: float,
-    rule: str = "diagonal",
-    weight: str = "unit",
-    origin: np.ndarray | None = None,
-) -> np.ndarray:
-    """Estimate the normal of every point: `oriented_normals` of `edge_pair_sums`."""
-    sums = edge_pair_sums(points, start, view, gap=gap, rule=rule)
-    return oriented_normals(sums, points, start, view, weight=weight, origin=origin)

@@ -29,21 +29,22 @@ def fit_planes(
     Returns:
         `SurfaceKind` PLANE or NONE, shape (K,), i8; parameters, shape (K, 8), f64: a point, the
         normal (its side is not determined), NaN; their covariance, shape (K, 8, 8), f64; and the
-        root mean square distance [mm], shape (K,). All are NaN where the patch is no plane.
+        root mean square distance [mm], shape (K,). All are NaN where the patch is no plane; none is
+        if none has a leaf.
     """
     kind = np.full(patches, int(SurfaceKind.NONE), np.int8)
     parameters, spread = np.full((patches, 8), np.nan), np.full((patches, 8, 8), np.nan)
     residual = np.full(patches, np.nan)
     inside = label >= 0
     cells, owner = leaves[inside], label[inside]
-    if patches == 0:
+    if not inside.any():
         return kind, parameters, spread, residual
     # About a cell of the patch itself: small numbers lose few digits.
     size = grid.edge_length[cells]
     middle = (runtime.download(grid.node)[cells, X : Z + 1].T + 0.5) * size
     some = np.zeros(patches, np.int64)
     some[owner] = np.arange(len(owner))
-    anchor = middle[:, some] if len(cells) else np.zeros((3, patches))
+    anchor = middle[:, some]
     sums = point_sums(runtime.download(grid.moment)[cells], middle - anchor[:, owner], size)
     total = np.stack([np.bincount(owner, weights=row, minlength=patches) for row in sums])
     mean, product = total[1:4].T, total[4:].T

@@ -9,7 +9,13 @@ from reference.clouds import random_cloud
 from reference.device_grid import leaf_nodes, leaves_of, tables
 
 from octoseg_ti.device import runtime
-from octoseg_ti.stages.assignment import assign_points, claimed_share, points_of_leaves
+from octoseg_ti.stages.assignment import (
+    assign_points,
+    claimed_share,
+    in_rows,
+    places_of_rows,
+    points_of_leaves,
+)
 from octoseg_ti.stages.grid import Grid, build_grid
 from octoseg_ti.stages.moments import HI, LO
 
@@ -165,3 +171,16 @@ def test_without_any_label_nothing_joins() -> None:
         limit=9.0, tight=9.0, angle=1.0,
     )  # fmt: skip
     assert np.all(got == -1) and len(got) == 60
+
+
+def test_values_reach_the_rows_of_the_input() -> None:
+    grid, _, _ = made(1, 200)
+    rng = np.random.default_rng(1)
+    row = rng.permutation(260)[:200]
+    of_point = rng.integers(0, 100, 200).astype(np.int8)
+    place = places_of_rows(grid, row, 260)
+    got = in_rows(of_point[runtime.download(grid.order)], place, -1)
+    expected = np.full(260, -1, np.int8)
+    expected[row] = of_point
+    np.testing.assert_array_equal(got, expected)
+    assert got.dtype == np.int8 and (place == -1).sum() == 60

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from reference import filtering as plain
 from reference.clouds import lattice_stripes, ragged_stripes, unit
+from reference.device_normals import edge_pair_normals
 
 from octoseg_ti.stages.filtering import filter_normals, independent_lag, square_lag
 from octoseg_ti.stages.measure import stripe_noise
-from octoseg_ti.stages.normals import edge_pair_normals
 
 ABOVE = np.array([[0.0, 0.0, 500.0]])
 

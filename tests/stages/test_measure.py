@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from reference import stripes as plain
 from reference.clouds import lattice_stripes, ragged_stripes, unit
+from reference.device_normals import edge_pair_normals
 
 from octoseg_ti.stages.measure import stripe_noise, stripe_roughness, stripe_spacing
-from octoseg_ti.stages.normals import edge_pair_normals
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from reference import stripes as plain
 from reference.clouds import lattice_stripes, ragged_stripes, rotation
+from reference.device_normals import edge_pair_normals
 
-from octoseg_ti.stages.normals import edge_pair_normals, stripe_axes
+from octoseg_ti.stages.normals import stripe_axes
 
 
 @pytest.mark.parametrize("rule", ["diagonal", "paper"])

