@@ -8,10 +8,12 @@ order in which they were scanned.
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from octoseg_ti.device import runtime
+from octoseg_ti.device.linalg import row
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, I64Rows, ti
 from octoseg_ti.stages.adjacency import Adjacency
 from octoseg_ti.stages.grid import Grid
@@ -122,6 +124,30 @@ def _pick(
         count_out[c] = free
 
 
+@ti.kernel
+def _bound(
+    # In:
+    point_in: F64Rows,
+    first_in: I32Array,
+    # Out:
+    box_out: F64Rows,
+):
+    """Write the lower and upper corner of the points of every range."""
+    ranges = first_in.shape[0]
+    for r in range(ranges):
+        low = row(point_in, first_in[r])
+        high = low
+        end = point_in.shape[0]
+        if r + 1 < ranges:
+            end = first_in[r + 1]
+        for i in range(first_in[r] + 1, end):
+            low = ti.min(low, row(point_in, i))
+            high = ti.max(high, row(point_in, i))
+        for k in ti.static(range(3)):
+            box_out[r, k] = low[k]
+            box_out[r, 3 + k] = high[k]
+
+
 def leaf_graph(grid: Grid, node: np.ndarray, touching: Adjacency) -> Leaves:
     """Return the leaves of a grid and the pairs of them that touch.
 
@@ -143,7 +169,7 @@ def leaf_graph(grid: Grid, node: np.ndarray, touching: Adjacency) -> Leaves:
         first=grid.first[node],
         count=grid.holds[node],
         size=grid.edge_length[node],
-        box=leaf_boxes(runtime.download(grid.point), grid.first[node]),
+        box=runtime.download(boxes_of(grid.point, grid.first[node]))[: len(node)],
         a=a,
         b=b,
         start=start,
@@ -160,16 +186,22 @@ def _linked(count: int, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.nd
     return start.astype(np.int32), (key % max(count, 1)).astype(np.int32)
 
 
-def leaf_boxes(points: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Return the lower and upper corner of the points of every leaf [mm], shape (C, 6).
+def boxes_of(points: Any, first: np.ndarray) -> Any:
+    """Return the lower and upper corner of the points of every range [mm], shape (R, 6).
 
     Args:
-        points: Sorted positions [mm], shape (n, 3), f64.
-        first: First point of every leaf, ascending, shape (C,).
+        points: Sorted positions [mm], shape (n, 3), f64 (kernel array).
+        first: First point of every range, ascending, shape (R,), i32; each ends where the next one
+            begins.
+
+    Returns:
+        A kernel array.
     """
-    low = np.minimum.reduceat(points, first, axis=0)
-    high = np.maximum.reduceat(points, first, axis=0)
-    return np.concatenate([low, high], axis=1)
+    runtime.ensure_started()
+    box = runtime.empty((len(first), 6), np.float64)
+    if len(first):
+        _bound(points, runtime.upload(first), box)
+    return box
 
 
 def sample_leaves(

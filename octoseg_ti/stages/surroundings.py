@@ -13,7 +13,7 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import box_gap, row, vec3
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
-from octoseg_ti.stages.leaves import Leaves
+from octoseg_ti.stages.leaves import Leaves, boxes_of
 
 SECTORS = 24
 """Sectors around a point that hold neighbours or are free."""
@@ -25,26 +25,6 @@ BLOCK = 32
 
 _STEEPER = tuple(math.tan(2.0 * math.pi * k / SECTORS) for k in range(1, SECTORS // 4))
 """Tangents of the angles between the sectors of a quarter."""
-
-
-@ti.kernel
-def _bound_blocks(
-    # In:
-    point_in: F64Rows,
-    # Out:
-    box_out: F64Rows,
-):
-    """Write the lower and upper corner of every block of sorted points."""
-    for b in range(box_out.shape[0]):
-        first = b * BLOCK
-        low = row(point_in, first)
-        high = low
-        for i in range(first + 1, ti.min(first + BLOCK, point_in.shape[0])):
-            low = ti.min(low, row(point_in, i))
-            high = ti.max(high, row(point_in, i))
-        for k in ti.static(range(3)):
-            box_out[b, k] = low[k]
-            box_out[b, 3 + k] = high[k]
 
 
 @ti.func
@@ -222,8 +202,7 @@ class Surroundings:
             radius: Largest distance that will be asked for [mm].
         """
         runtime.ensure_started()
-        blocks = runtime.empty((-(-points.shape[0] // BLOCK), 6), np.float64)
-        _bound_blocks(points, blocks)
+        blocks = boxes_of(points, np.arange(0, points.shape[0], BLOCK, dtype=np.int32))
         small = leaves.size < radius
         self._points = points
         self._leaves = (
