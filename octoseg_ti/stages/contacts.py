@@ -43,7 +43,7 @@ def smooth_contacts(
         Of the pairs with points in one leaf, or in leaves that touch, those whose normals agree
         somewhere there.
     """
-    one, other, leaf = touches(leaves, own)
+    one, other, leaf = _touches(leaves, own)
     width = len(surfaces)
     key = np.minimum(one, other).astype(np.int64) * width + np.maximum(one, other)
     order = np.argsort(key, kind="stable")
@@ -63,12 +63,12 @@ def smooth_contacts(
     return found.some(facing >= np.cos(_EDGE))
 
 
-def touches(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _touches(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return two surfaces, and a leaf, for every place where surfaces touch, each shape (T,)."""
     held = (own >= 0).sum(axis=1)
     cells = np.arange(len(own), dtype=np.int32)
     a, b = np.concatenate([leaves.a, cells]), np.concatenate([leaves.b, cells])
-    only = only_surface(own)
+    only = _only_surface(own)
     some = (only[a] < 0) | (only[a] != only[b])
     some[some] = (held[a[some]] > 0) & (held[b[some]] > 0)
     a, b = a[some], b[some]
@@ -80,6 +80,6 @@ def touches(leaves: Leaves, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     return one[differ], other[differ], a[at[differ]]
 
 
-def only_surface(own: np.ndarray) -> np.ndarray:
+def _only_surface(own: np.ndarray) -> np.ndarray:
     """Return the surface of leaves that have one, -1 of others, shape (C,)."""
     return np.where(own[:, 1] < 0, own[:, 0], NONE)
