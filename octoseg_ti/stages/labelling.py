@@ -141,7 +141,10 @@ def _choose(
     second_inout: I32Array,
     off_inout: F32Rows,
 ):
-    """Find the two best surfaces of every point of some leaves, and those these end up with."""
+    """Find the two best surfaces of every point of some leaves, and those these end up with.
+
+    The rule is that of `Rule`, its deviations by their inverses.
+    """
     for e in todo_in:
         c = todo_in[e]
         for k in range(MOST):
@@ -157,12 +160,12 @@ def _choose(
             while k < MOST and near_in[c, k] >= 0:
                 s = near_in[c, k]
                 d, n = surface_in_row(surface_in, s, ti.cast(surface_in[s, 8], ti.i32), p)
-                off = ti.abs(d) / rule[0]
+                off = ti.abs(d) * rule[0]
                 least = off * off + surface_in[s, 9]
                 if least < after[0] or (off <= rule[2] and least < best[0]):
                     facing = ti.select(m.norm_sqr() > 0.0, ti.abs(n.dot(m)), 1.0)
                     angle = angle_of(ti.min(1.0, facing))
-                    turn = angle / rule[1]
+                    turn = angle * rule[1]
                     # Beyond six deviations hardly more: of two surfaces through a point of an edge
                     # the one that it faces a little.
                     tilt = ti.min(turn, 6.0 + 0.1 * ti.max(turn - 6.0, 0.0))
@@ -287,16 +290,17 @@ class Labelling:
         runtime.ensure_started()
         n = grid.order.shape[0]
         self.grid, self.rule, self.count = grid, rule, len(leaves)
+        # Where nothing is near, nothing is chosen.
         self.choice = Choice(
-            runtime.empty(n, np.int32),
-            runtime.empty(n, np.int32),
-            runtime.empty((n, 3), np.float32),
+            runtime.upload(np.full(n, NONE, np.int32)),
+            runtime.upload(np.full(n, NONE, np.int32)),
+            runtime.upload(np.full((n, 3), 1e30, np.float32)),
         )
         self._start, self._neighbor = runtime.upload(leaves.start), runtime.upload(leaves.neighbor)
         self._leaf = runtime.upload(np.stack([leaves.first, leaves.count], axis=1))
         self._surfaces = np.zeros((0, 10))
-        # What every leaf saw the last time: nothing that a list can hold.
-        self._near = runtime.upload(np.full((len(leaves), MOST), NONE - 1, np.int32))
+        # What every leaf saw the last time.
+        self._near = runtime.upload(np.full((len(leaves), MOST), NONE, np.int32))
         self._own = np.full((len(leaves), MOST), NONE, np.int32)
 
     def choose(
@@ -332,8 +336,9 @@ class Labelling:
             own = self._own.copy()
             if len(stale):
                 held = runtime.upload(own)
+                rule = self.rule._replace(noise=1.0 / self.rule.noise, tilt=1.0 / self.rule.tilt)
                 _choose(
-                    tuple(self.rule), runtime.upload(stale), self.grid.point, self.grid.normal,
+                    tuple(rule), runtime.upload(stale), self.grid.point, self.grid.normal,
                     self._leaf, near, device_surfaces, held, *self.choice,
                 )  # fmt: skip
                 own = runtime.download(held)

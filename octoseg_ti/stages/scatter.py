@@ -59,7 +59,7 @@ def surface_noise(
     Returns:
         Both deviations; None where no region is large enough to tell.
     """
-    index, begin = _neighborhoods(runtime.download(grid.key), np.repeat(group, grid.holds[leaves]))
+    index, begin = _neighborhoods(runtime.download(grid.key), grid.first[leaves], group)
     count = np.diff(begin)
     if len(count) == 0:
         return None
@@ -77,39 +77,44 @@ def surface_noise(
     return max(_typical(rms), float(np.hypot(within, apart))), apart
 
 
-def _neighborhoods(key: np.ndarray, region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _neighborhoods(
+    key: np.ndarray, first: np.ndarray, region: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return neighbourhoods all over a part, each within one region.
 
     Args:
         key: Morton keys of the sorted points, shape (n,).
-        region: Region of every sorted point, -1 = none, shape (n,).
+        first: First point of every leaf, ascending, shape (C,).
+        region: Region of every leaf, -1 = none, shape (C,).
 
     Returns:
         The sorted points of each, one neighbourhood after the other, ascending, shape (S,); and the
         first of these of every neighbourhood, and S at the end, shape (G + 1,).
     """
-    inside = np.flatnonzero(region >= 0)
+    count = np.diff(first, append=len(key))
+    inside = np.flatnonzero(np.repeat(region >= 0, count))
     if len(inside) == 0:
         return inside, np.zeros(1, np.int64)
     # Whole boxes: which points of a box come first would depend on the order of the input.
-    first = np.unique(np.searchsorted(key, key[inside[np.arange(_COUNT) * len(inside) // _COUNT]]))
-    first = first[region[first] >= 0]
-    last = np.searchsorted(key, key[np.minimum(first + _WINDOW * _POINTS, len(key) - 1)])
-    index, owner = ranges(first, last - first), np.repeat(np.arange(len(first)), last - first)
-    index, owner = _some(region[index] == region[first][owner], index, owner)
-    count = np.bincount(owner, minlength=len(first))
-    ends = np.cumsum(count)
-    farthest = key[index[np.minimum(ends - count + _POINTS, ends) - 1]]
-    index, owner = _some(key[index] <= farthest[owner], index, owner)
-    count = np.bincount(owner, minlength=len(first))
-    index, _ = _some(count[owner] >= _FEWEST, index, owner)
-    return index, np.append(0, np.cumsum(count[count >= _FEWEST]))
-
-
-def _some(kept: np.ndarray, *rows: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return some of the rows of each array."""
-    where = np.flatnonzero(kept)
-    return tuple(array[where] for array in rows)
+    begin = np.unique(np.searchsorted(key, key[inside[np.arange(_COUNT) * len(inside) // _COUNT]]))
+    limit = np.searchsorted(key, key[np.minimum(begin + _WINDOW * _POINTS, len(key) - 1)])
+    # The points region after region, those of one region in Morton order.
+    order = np.argsort(region, kind="stable")
+    point = ranges(first[order], count[order])
+    ends = np.cumsum(count[order])
+    place = np.empty(len(order), np.int64)
+    place[order] = ends - count[order]
+    leaf = np.searchsorted(first, begin, "right") - 1
+    start = place[leaf] + begin - first[leaf]
+    within = ends[np.searchsorted(region[order], region[leaf], "right") - 1]
+    farthest = np.minimum(start + _POINTS, within) - 1
+    end = farthest + np.searchsorted(key, key[point[farthest]], "right") - point[farthest]
+    owner = np.repeat(np.arange(len(begin)), end - start)
+    index = point[ranges(start, end - start)]
+    near = index < limit[owner]
+    size = np.bincount(owner[near], minlength=len(begin))
+    kept = np.flatnonzero(near & (size >= _FEWEST)[owner])
+    return index[kept], np.append(0, np.cumsum(size[size >= _FEWEST]))
 
 
 def _shuffled(point: np.ndarray, group: np.ndarray) -> np.ndarray:

@@ -79,22 +79,24 @@ def test_neighbourhoods_equal_the_reference(seed: int, many: int) -> None:
     """A window of points, of these one region's, of these the first, with the rest of a box."""
     rng = np.random.default_rng(seed)
     key = np.sort(rng.integers(0, many // 2, many))
-    region = np.append(0, rng.integers(-1, 3, many))[key // 10]
+    first = np.flatnonzero(np.diff(key // 10, prepend=-1))
+    of_leaf = np.append(0, rng.integers(-1, 3, len(first) - 1))
+    region = np.repeat(of_leaf, np.diff(first, append=many))
     inside = np.flatnonzero(region >= 0)
     expected: list[np.ndarray] = []
-    for first in np.unique(np.searchsorted(key, key[inside[np.arange(256) * len(inside) // 256]])):
-        last = np.searchsorted(key, key[min(first + 512, many - 1)])
-        mine = [i for i in range(first, last) if region[i] == region[first]]
+    for begin in np.unique(np.searchsorted(key, key[inside[np.arange(256) * len(inside) // 256]])):
+        last = np.searchsorted(key, key[min(begin + 512, many - 1)])
+        mine = [i for i in range(begin, last) if region[i] == region[begin]]
         mine = [i for i in mine if key[i] <= key[mine[min(127, len(mine) - 1)]]]
-        if region[first] >= 0 and len(mine) >= 24:
+        if len(mine) >= 24:
             expected.append(np.array(mine))
-    index, begin = _neighborhoods(key, region)
-    np.testing.assert_array_equal(begin, np.cumsum([0, *(len(mine) for mine in expected)]))
+    index, start = _neighborhoods(key, first, of_leaf)
+    np.testing.assert_array_equal(start, np.cumsum([0, *(len(mine) for mine in expected)]))
     np.testing.assert_array_equal(index, np.concatenate([np.zeros(0, np.int64), *expected]))
     assert many < 1000 or len(expected) > 2
 
 
 def test_no_region_has_no_neighbourhoods() -> None:
-    index, begin = _neighborhoods(np.arange(100), np.full(100, -1))
+    index, begin = _neighborhoods(np.arange(100), np.array([0, 50]), np.full(2, -1))
     assert len(index) == 0
     assert begin.tolist() == [0]
