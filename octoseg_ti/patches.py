@@ -202,9 +202,14 @@ def assemble(
     rank = np.argsort(-(size + np.bincount(back[back >= 0], minlength=patches)), kind="stable")
     name = np.full(patches + 1, NONE, np.int32)
     name[rank] = np.arange(patches, dtype=np.int32)
-    points, normals = np.empty((n, 3)), np.zeros((n, 3), np.float32)
-    given = slice(None) if arranged.whole else arranged.row
-    points[given], normals[given], points[left_out] = point, normal, outside
+    normals = normal.astype(np.float32)
+    if arranged.whole:
+        points = point.copy()
+    else:
+        given = np.full(n, NONE, np.intp)
+        given[arranged.row] = np.arange(len(point))
+        points, normals = point.take(given, axis=0), normals.take(given, axis=0)
+        points[left_out], normals[left_out] = outside, 0.0
     labels = in_rows(name.take(found.label), place, NONE)
     labels[left_out] = name[back]
     outlier[left_out[back >= 0]] = 0

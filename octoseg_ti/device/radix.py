@@ -13,7 +13,8 @@ from octoseg_ti.device import runtime
 from octoseg_ti.device.runtime import I32Array, I32Rows, I64Array, ti
 
 _MOST_DIGIT_BITS = 12
-_MOST_PACKED_BITS = 63  # of a key and a place in one number
+# So many keys NumPy sorts faster on one core than the kernel on two.
+_MOST_PACKED = 1 << 18
 
 
 @ti.kernel
@@ -84,7 +85,7 @@ def sort_pairs(key: Any, index: Any, bits: int) -> tuple[Any, Any]:
     if n == 0:
         return key, index
     place_bits = (n - 1).bit_length()
-    if runtime.on_cpu() and bits + place_bits <= _MOST_PACKED_BITS:
+    if n <= _MOST_PACKED and bits + place_bits <= 63 and runtime.on_cpu():
         # With the place in its low bits no key is twice there, so that NumPy's sort, which is not
         # stable but much faster, does.
         order = np.sort((key << place_bits) | np.arange(n)) & ((1 << place_bits) - 1)

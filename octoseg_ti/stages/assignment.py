@@ -13,11 +13,10 @@ from octoseg_ti.device.linalg import row, vec3
 from octoseg_ti.device.morton import compacted
 from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, I64Array, ti
 from octoseg_ti.stages.grid import Grid, find_node
-from octoseg_ti.stages.moments import LEVEL, POINT
+from octoseg_ti.stages.moments import HI, LEVEL, LO, POINT
 from octoseg_ti.types import NONE
 
 _ROUNDS = 3
-_ASKED = -2  # the label of points for which one is looked for
 _BEND = -2  # the label of cells that have none and lie on a bend
 
 ivec3: Any = ti.types.vector(3, ti.i32)
@@ -93,6 +92,7 @@ def _join(
     rule: vec3,
     boxes: ivec4,
     # In:
+    asked_in: I32Array,
     key_in: I64Array,
     point_in: F64Rows,
     node_in: I32Rows,
@@ -103,44 +103,37 @@ def _join(
     # Out:
     label_inout: I32Array,
 ):
-    """Label the points that are asked for, run by run of points in one smallest box.
+    """Label the points of some cells, run by run of points in one smallest box.
 
     The rule holds the largest distance from the plane, that distance on a bend where the normals
     differ, and the cosine from which they do not.
     """
-    for i in label_inout:
-        # Only the first point of a run looks at labels: nobody else writes those of its run.
-        if i == 0 or key_in[i] != key_in[ti.max(0, i - 1)]:
-            if label_inout[i] == _ASKED:
-                key = key_in[i]
-                at = ivec3(compacted(key, 0), compacted(key, 1), compacted(key, 2))
-                shape = ivec3(boxes[0], boxes[1], boxes[2])
-                own = find_node(at[0], at[1], at[2], boxes[3], shape, boxes[3], root_in, child_in)
-                level = boxes[3] - node_in[own, LEVEL]
-                bend = ti.select(cell_label_in[own] == _BEND, own, -1)
-                near = near_cells(-1)
-                left = 1
-                reach = 1
-                while left > 0:
-                    left = 0
-                    count = _collect(
-                        at, level, reach, boxes, root_in, child_in, cell_label_in, near
-                    )
-                    j = i
-                    while j >= 0:
-                        if label_inout[j] == _ASKED:
-                            p = row(point_in, j)
-                            found = _choose(p, bend, rule, count, near, mean_in, cell_label_in)
-                            if found >= 0 or reach == rounds:
-                                label_inout[j] = found
-                            else:
-                                left += 1
-                        j += 1
-                        if j == label_inout.shape[0]:
-                            j = -1
-                        elif key_in[j] != key_in[i]:
-                            j = -1
-                    reach += 1
+    for u in asked_in:
+        own = asked_in[u]
+        level = boxes[3] - node_in[own, LEVEL]
+        bend = ti.select(cell_label_in[own] == _BEND, own, -1)
+        near = near_cells(-1)
+        end = node_in[own, HI]
+        lo = node_in[own, LO]
+        while lo < end:
+            key = key_in[lo]
+            at = ivec3(compacted(key, 0), compacted(key, 1), compacted(key, 2))
+            hi = lo
+            left = 1
+            reach = 1
+            while left > 0 and reach <= rounds:
+                left = 0
+                count = _collect(at, level, reach, boxes, root_in, child_in, cell_label_in, near)
+                hi = lo
+                while hi < end and key_in[ti.min(hi, end - 1)] == key:
+                    if label_inout[hi] < 0:
+                        p = row(point_in, hi)
+                        found = _choose(p, bend, rule, count, near, mean_in, cell_label_in)
+                        label_inout[hi] = found
+                        left += ti.cast(found < 0, ti.i32)
+                    hi += 1
+                reach += 1
+            lo = hi
 
 
 def places_of_rows(grid: Grid, row: np.ndarray, rows: int) -> np.ndarray:
@@ -184,6 +177,14 @@ def points_of_leaves(grid: Grid, leaves: np.ndarray, values: np.ndarray) -> np.n
     return np.repeat(values, grid.holds[leaves])
 
 
+def points_in(grid: Grid, cells: np.ndarray) -> np.ndarray:
+    """Return the sorted points in some cells, cell after cell, i32."""
+    holds = grid.holds[cells]
+    ends = np.cumsum(holds, dtype=np.int32)
+    offset = grid.first[cells] - (ends - holds)
+    return np.arange(holds.sum(), dtype=np.int32) + np.repeat(offset, holds)
+
+
 def assign_points(
     grid: Grid,
     leaves: np.ndarray,
@@ -217,24 +218,24 @@ def assign_points(
         Label of every sorted point, -1 where no patch fits, shape (n,), i32.
     """
     runtime.ensure_started()
-    label = cell_label[leaves]
-    if not np.any(label >= 0):
-        return points_of_leaves(grid, leaves, label)
-    asked = label < 0
-    if only is not None:
-        asked &= only[leaves]
-    label = runtime.upload(points_of_leaves(grid, leaves, np.where(asked, np.int32(_ASKED), label)))
+    own = cell_label[leaves]
+    label = np.ascontiguousarray(points_of_leaves(grid, leaves, own), np.int32)
+    asked = own < 0 if only is None else (own < 0) & only[leaves]
+    if not asked.any() or not np.any(own >= 0):
+        return label
+    label = runtime.upload(label)
     _join(
         rounds,
         (limit, tight, float(np.cos(angle))),
         (*grid.shape, grid.depth),
+        runtime.upload(leaves[asked].astype(np.int32)),
         grid.key,
         grid.point,
         grid.node,
         grid.child,
         grid.root,
         grid.mean,
-        runtime.upload(np.where(bend & (cell_label < 0), np.int32(_BEND), cell_label)),
+        runtime.upload(np.where(bend & (cell_label < 0), _BEND, cell_label).astype(np.int32)),
         label,
     )
     return runtime.download(label)
@@ -254,11 +255,13 @@ def claimed_share(
     Returns:
         Share of labelled points, 0 for an empty group, shape (G,), f64.
     """
-    named = group[leaves] + 1
-    groups = int(named.max(initial=0))
-    if groups == 0:
-        return np.zeros(0)
-    labelled = np.add.reduceat((label >= 0).astype(np.int32), grid.first[leaves])
-    total = np.bincount(named, weights=grid.holds[leaves], minlength=groups + 1)[1:]
-    found = np.bincount(named, weights=labelled, minlength=groups + 1)[1:]
+    groups = int(group.max(initial=NONE)) + 1
+    inside = leaves[group[leaves] >= 0]
+    if len(inside) == 0:
+        return np.zeros(groups)
+    count = grid.holds[inside]
+    begin = np.cumsum(count) - count
+    labelled = np.add.reduceat((label[points_in(grid, inside)] >= 0).astype(np.int32), begin)
+    total = np.bincount(group[inside], weights=count, minlength=groups)
+    found = np.bincount(group[inside], weights=labelled, minlength=groups)
     return found / np.maximum(total, 1)

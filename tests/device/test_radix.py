@@ -21,8 +21,8 @@ def check(key: np.ndarray, bits: int, seed: int) -> None:
     order = np.argsort(key, kind="stable")
     index = np.random.default_rng(seed + 1).permutation(len(key)).astype(np.int32)
     runtime.ensure_started()
-    for packed in (63, 0):  # by NumPy where it can be, and by digits
-        with patch.object(radix, "_MOST_PACKED_BITS", packed):
+    for packed in (len(key), 0):  # by NumPy where it can be, and by digits
+        with patch.object(radix, "_MOST_PACKED", packed):
             out_key, out_index = sorted_pairs(key, index, bits)
         what = f"seed {seed}, {bits} bits, {packed} packed"
         np.testing.assert_array_equal(out_key, key[order], err_msg=what)
