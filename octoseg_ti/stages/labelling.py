@@ -291,10 +291,12 @@ class Labelling:
         n = grid.order.shape[0]
         self.grid, self.rule, self.count = grid, rule, len(leaves)
         # Where nothing is near, nothing is chosen.
+        off = np.full((n, 3), 1e30, np.float32)
+        off[:, 2] = 0.0
         self.choice = Choice(
             runtime.upload(np.full(n, NONE, np.int32)),
             runtime.upload(np.full(n, NONE, np.int32)),
-            runtime.upload(np.full((n, 3), 1e30, np.float32)),
+            runtime.upload(off),
         )
         self._start, self._neighbor = runtime.upload(leaves.start), runtime.upload(leaves.neighbor)
         self._leaf = runtime.upload(np.stack([leaves.first, leaves.count], axis=1))
