@@ -271,9 +271,10 @@ def ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
 
 def members_of(label: np.ndarray, count: int) -> list[np.ndarray]:
     """Return the members of every label 0..count-1, ascending, an array of indices for each."""
-    n = max(len(label), 1)
     # All keys differ: to sort them is faster than to sort places by them.
-    key = np.sort(label.astype(np.int64) * n + np.arange(len(label)))
-    ends = np.searchsorted(key, np.arange(count + 1) * n)
-    order = key % n
+    bits = len(label).bit_length()
+    kind = np.int32 if bits + count.bit_length() < 31 else np.int64
+    key = np.sort((label.astype(kind) << bits) | np.arange(len(label), dtype=kind))
+    ends = np.searchsorted(key, np.arange(count + 1, dtype=kind) << bits)
+    order = (key & ((1 << bits) - 1)).astype(np.int64)
     return [order[lo:hi] for lo, hi in pairwise(ends)]
