@@ -92,17 +92,20 @@ def _join(
     Returns:
         As ``label``.
     """
-    left = label < 0
-    if not left.any():
+    left = np.flatnonzero(label < 0)
+    if len(left) == 0:
         return label
-    own = label_lists(graph, np.where(label < len(table), label, NONE))
+    free = label.max() >= len(table)
+    own = label_lists(graph, np.where(label < len(table), label, NONE) if free else label)
+    closed = np.ones(len(graph), bool)
+    closed[np.searchsorted(graph.first, left, side="right") - 1] = False
     labelling = Labelling(grid, graph, rule)
-    labelling.choose(own, table, closed=~np.logical_or.reduceat(left, graph.first))
+    labelling.choose(own, table, closed=closed)
     chosen, second, off = labelling.choice
-    label = np.where(left, runtime.download(chosen), label).astype(np.int32)
-    second = np.where(left, runtime.download(second), NONE).astype(np.int32)
+    label, others = label.copy(), np.full_like(label, NONE)
+    label[left], others[left] = runtime.download(chosen)[left], runtime.download(second)[left]
     return settle(
-        grid.point, graph, runtime.upload(label), runtime.upload(second), off, table,
+        grid.point, graph, runtime.upload(label), runtime.upload(others), off, table,
         reach=AROUND * float(graph.size.min()), farthest=rule.reach,
     )  # fmt: skip
 
