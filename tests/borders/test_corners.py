@@ -178,6 +178,6 @@ def test_balls_that_pass_as_cones_are_corners(radius: float, seed: int) -> None:
     result = segment(scans)
     scores = evaluate(result, truth)
     assert scores.edges["sharp"].precision > 0.93 and scores.edges["sharp"].recall > 0.95
-    assert scores.edges["fillet"].precision > 0.98 and scores.edges["fillet"].recall > 0.89
+    assert scores.edges["fillet"].precision > 0.98 and scores.edges["fillet"].recall > 0.87
     assert result.fillets is not None and len(result.fillets) == 8
     np.testing.assert_allclose(np.abs(result.fillets.radius), radius, rtol=0.05)
