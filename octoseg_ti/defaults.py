@@ -19,8 +19,11 @@ CELL_SPACINGS = 1.8
 """Smallest cell in point spacings: about three points in a cell."""
 GAP_SPACINGS = 3.0
 """A strip of triangles breaks where an edge is longer than this many spacings."""
-PIECE_GAPS = 2.0
-"""Points of one piece of a surface are linked over so many times that length."""
+PIECE_GAPS = 3.0
+"""Points of one piece of a surface are linked over so many times that length: where stripes graze a
+face they are farther apart than elsewhere."""
+BACK_GAPS = 2.0
+"""What cleaning left out comes back where it is linked to a patch over so many times that length."""
 REACH_SPACINGS = 3.0
 """A point finds its partner in another view within this many spacings."""
 SPIKE_SPACINGS = 0.1

@@ -9,7 +9,7 @@ import numpy as np
 
 from octoseg_ti.arrange import Arranged
 from octoseg_ti.borders.tracing import Borders
-from octoseg_ti.defaults import PIECE_GAPS, spacing_of
+from octoseg_ti.defaults import BACK_GAPS, spacing_of
 from octoseg_ti.device import runtime
 from octoseg_ti.device.surfaces import distances_to_surfaces
 from octoseg_ti.params import Params
@@ -268,7 +268,7 @@ def _come_back(outside: np.ndarray, grid: Grid, found: Regions, params: Params) 
     assert found.kind is not None and found.parameters is not None
     return readmit(
         outside - grid.corner, runtime.download(grid.point), found.label, found.surface,
-        found.kind, found.parameters, noise=noise, gap=PIECE_GAPS * gap,
+        found.kind, found.parameters, noise=noise, gap=BACK_GAPS * gap,
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from octoseg_ti.stages.leaves import Leaves
 from octoseg_ti.stages.pieces import pieces
 from octoseg_ti.stages.sets import Surfaces
 from octoseg_ti.surface_search import EXPLAINED, FREE, Surfaced
-from octoseg_ti.surfacing import _with_free_forms, number_pieces
+from octoseg_ti.surfacing import _with_free_forms, connected_pieces, number_pieces
 
 LEAST = 20
 
@@ -212,3 +212,14 @@ def test_a_shallow_round_that_noise_hides_is_a_patch() -> None:
     assert abs(result.parameters[2, 6] / radius - 1.0) < 0.1
     sharp = segment(stripes(-abs(x) * np.tan(half), step, 0, 0.05))
     assert sharp.kind.tolist() == [SurfaceKind.PLANE] * 2
+
+
+@pytest.mark.parametrize(("apart", "count"), [(0.6, 1), (1.2, 1), (1.8, 2)])
+def test_stripes_that_graze_a_face_are_one_piece(apart: float, count: int) -> None:
+    """Two faces of one plane, so far apart that a triangle of 0.5 mm would not span it."""
+    x, y = (a.ravel() for a in np.mgrid[0.05:8.0:0.1, 0.05:3.0:0.1])
+    points = np.column_stack([x, y, 0.0 * x])[np.abs(x - 4.0) > apart / 2.0]
+    leaves, order = leaves_of(points, 2.0)
+    found = surfaced(leaves, np.zeros(len(points)), np.full(len(points), 9.0), 1)
+    piece = connected_pieces(points[order], leaves, found, 0.5)
+    assert len(np.unique(piece[found.own >= 0])) == count
