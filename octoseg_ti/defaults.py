@@ -23,7 +23,7 @@ PIECE_GAPS = 3.0
 """Points of one piece of a surface are linked over so many times that length: where stripes graze a
 face they are farther apart than elsewhere."""
 BACK_GAPS = 2.0
-"""What cleaning left out comes back where it is linked to a patch over so many times that length."""
+"""What cleaning left out comes back where it is linked to a patch over so many times it."""
 REACH_SPACINGS = 3.0
 """A point finds its partner in another view within this many spacings."""
 SPIKE_SPACINGS = 0.1
