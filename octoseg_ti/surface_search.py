@@ -29,13 +29,11 @@ from octoseg_ti.stages.labelling import (
 )
 from octoseg_ti.stages.leaves import Leaves, Samples, joined_samples, members_of, sample_leaves
 from octoseg_ti.stages.merging import cut_out, explained_by_others, merge_surfaces
+from octoseg_ti.stages.refitting import FEWEST, fitted_to_others, refitted
 from octoseg_ti.stages.rounds import hidden_rounds, refitted_rounds
 from octoseg_ti.stages.sets import (
     Surfaces,
-    apart,
-    fit_sets,
     flat_sets,
-    lie_on,
     no_surfaces,
     rms_of,
     sets_of,
@@ -60,15 +58,8 @@ _SAMPLES, _REST = 4, 6
 _AROUND, _HARDLY = 12, 1e-3
 # A leaf takes part in a new group when so many of its points fit nothing, or one in so many.
 _LEFT_POINTS, _LEFT_SHARE = 2, 3
-# Samples for fitting a surface anew, and the fewest that are worth it.
-_REFIT, _FEWEST = 300, 10
-# ... away from other surfaces, if there are so many of these.
+# Samples away from other surfaces tell alone, if there are so many of them.
 _INNER = 40
-# What a surface was fitted to tells as much as what it has now when it has kept this share of that,
-# and has no more than so many times that.
-_SAME, _MORE = 0.95, 1.25
-# A surface that moves by less, in noises, stays where it is.
-_MOVED = 0.2
 # Samples when it is settled which points are its own, and of one leaf at most.
 _SETTLED, _DENSE = 600, 32
 _MERGES = 8
@@ -204,7 +195,7 @@ class _Search:
     def refit(self) -> None:
         """Fit the surfaces anew to the samples that chose them, if they were fitted to others."""
         label = self.label[self.samples.index]
-        changed = self.changed(label)
+        changed = np.append(fitted_to_others(self.fitted, label, len(self.surfaces)), False)
         self.fitted = np.where(changed[label], label, self.fitted)
         members = members_of(label, len(self.surfaces))
         # Points beside other surfaces may belong to these: where there are enough, others count.
@@ -215,38 +206,9 @@ class _Search:
             i if len(i) >= _INNER and 4 * len(i) >= len(m) else m
             for i, m in zip(inner, members, strict=True)
         ]
-        many = np.array([len(m) >= _FEWEST for m in members], bool)
-        which = np.flatnonzero(many & changed[:-1])
-        sets = [spread(members[m], _REFIT) for m in which]
-        noise = self.tolerance.noise
-        fitted, fits = fit_sets(self.samples, sets, noise, robust=True)
-        new = lie_on(self.samples, sets, fitted, fits, 3.0 * noise, 0.5)
-        before = self.surfaces.at(which[fitted])
-        old = lie_on(self.samples, sets, fitted, before, 3.0 * noise, 0.5)
-        # What has hardly moved stays: nothing near it has to choose again.
-        moved = apart(self.samples, sets, fitted, before, fits) > _MOVED * noise
-        moved |= before.kind != fits.kind
-        kind, parameters = self.surfaces.kind.copy(), self.surfaces.parameters.copy()
-        for k, f in enumerate(fitted):
-            if moved[k] and new[k].mean() >= old[k].mean() - 0.01:
-                kind[which[f]], parameters[which[f]] = fits.kind[k], fits.parameters[k]
-        self.surfaces = Surfaces(kind=kind, parameters=parameters)
-
-    def changed(self, label: np.ndarray) -> np.ndarray:
-        """Return which surfaces have other samples than they were fitted to.
-
-        Args:
-            label: Surface of every sample, -1 = none, shape (A,), i32.
-
-        Returns:
-            Shape (M + 1,), bool; no, for none, at the end.
-        """
-        count = len(self.surfaces)
-        before, now, both = (
-            np.bincount(of + 1, minlength=count + 1)[1:]
-            for of in (self.fitted, label, np.where(self.fitted == label, label, NONE))
+        self.surfaces = refitted(
+            self.samples, members, changed[:-1], self.surfaces, self.tolerance.noise
         )
-        return np.append((both < _SAME * before) | (now > _MORE * before), False)
 
     def refit_settled(self) -> np.ndarray:
         """Fit the surfaces to more of their points, up to the edges: these are settled now.
@@ -272,7 +234,7 @@ class _Search:
         noise = self.tolerance.noise
         kind, parameters = self.surfaces.kind.copy(), self.surfaces.parameters.copy()
         # Some points of the next surface can bend a plane.
-        many = np.array([len(s) >= _FEWEST for s in sets], bool)
+        many = np.array([len(s) >= FEWEST for s in sets], bool)
         base = count - len(self.sides)
         many[base:] = False
         curved = np.flatnonzero((kind != SurfaceKind.PLANE) & many)

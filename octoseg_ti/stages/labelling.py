@@ -141,10 +141,7 @@ def _choose(
     second_inout: I32Array,
     off_inout: F32Rows,
 ):
-    """Find the two best surfaces of every point of some leaves, and those these end up with.
-
-    The rule is that of `Rule`, its deviations by their inverses.
-    """
+    """Find the two best surfaces of every point of some leaves, and those these end up with."""
     for e in todo_in:
         c = todo_in[e]
         for k in range(MOST):
@@ -160,7 +157,7 @@ def _choose(
             while k < MOST and near_in[c, k] >= 0:
                 s = near_in[c, k]
                 d, n = surface_in_row(surface_in, s, ti.cast(surface_in[s, 8], ti.i32), p)
-                off = ti.abs(d) * rule[0]
+                off = ti.abs(d) * rule[0]  # of the rule's deviations the inverses
                 least = off * off + surface_in[s, 9]
                 if least < after[0] or (off <= rule[2] and least < best[0]):
                     facing = ti.select(m.norm_sqr() > 0.0, ti.abs(n.dot(m)), 1.0)

@@ -232,13 +232,13 @@ def _sum_up(
                         )
                         off = f[0]
                         if ti.abs(off) < cap:
-                            sum_inout[k, 0] += off * off
+                            sum_inout[k, 0] = sum_inout[k, 0] + off * off
                             if ti.cast(f[2], ti.i32) == BALL:
-                                sum_inout[k, 1] += off * f[4]
-                                sum_inout[k, 2] += f[4] * f[4]
-                                sum_inout[k, 3] += 1.0
+                                sum_inout[k, 1] = sum_inout[k, 1] + off * f[4]
+                                sum_inout[k, 2] = sum_inout[k, 2] + f[4] * f[4]
+                                sum_inout[k, 3] = sum_inout[k, 3] + 1.0
                         else:
-                            sum_inout[k, 0] += cap * cap
+                            sum_inout[k, 0] = sum_inout[k, 0] + cap * cap
 
 
 @ti.func
