@@ -171,13 +171,18 @@ def test_without_corners_there_are_no_parts() -> None:
     assert not parts.patch.any() and len(parts.strip) == 0
 
 
-@pytest.mark.parametrize(("radius", "seed"), [(2.5, 3), (1.3, 2)])
-def test_balls_that_pass_as_cones_are_corners(radius: float, seed: int) -> None:
+@pytest.mark.parametrize(("radius", "seeds"), [(2.5, (3,)), (1.3, (1, 2, 3))])
+def test_balls_that_pass_as_cones_are_corners(radius: float, seeds: tuple[int, ...]) -> None:
     scanner = StripeScanner(stripe_pitch=0.25, range_noise=0.025)
-    scans, truth = simulate(rounded_block(8.0, 6.0, 6.0, radius), scanner, seed=seed)
-    result = segment(scans)
-    scores = evaluate(result, truth)
-    assert scores.edges["sharp"].precision > 0.93 and scores.edges["sharp"].recall > 0.95
-    assert scores.edges["fillet"].precision > 0.98 and scores.edges["fillet"].recall > 0.87
-    assert result.fillets is not None and len(result.fillets) == 8
-    np.testing.assert_allclose(np.abs(result.fillets.radius), radius, rtol=0.05)
+    rows: list[tuple[float, ...]] = []
+    for seed in seeds:
+        scans, truth = simulate(rounded_block(8.0, 6.0, 6.0, radius), scanner, seed=seed)
+        result = segment(scans)
+        edges = evaluate(result, truth).edges
+        rows.append(
+            tuple(x for k in ("sharp", "fillet") for x in (edges[k].precision, edges[k].recall))
+        )
+        assert result.fillets is not None and len(result.fillets) == 8
+        np.testing.assert_allclose(np.abs(result.fillets.radius), radius, rtol=0.05)
+    # Of the few points of small corners chance takes some: of one scan more, of another fewer.
+    assert np.all(np.mean(rows, axis=0) > [0.93, 0.95, 0.98, 0.89])
