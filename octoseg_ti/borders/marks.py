@@ -9,12 +9,12 @@ from octoseg_ti.borders.fillets import ON, Fit, smooth_pairs
 from octoseg_ti.borders.zones import CAP, EDGE, Search, Zones, starts_of
 from octoseg_ti.stages.leaves import distinct, ranges
 from octoseg_ti.stages.marking import marked_near
-from octoseg_ti.stages.profiles import points_beside
+from octoseg_ti.stages.profiles import SHARP, SMOOTH, points_beside
 from octoseg_ti.types import EdgeClass
 
 _FEWEST = 5  # an edge with fewer points around it is no line
 
-SHARP, SMOOTH, FILLET = (int(e) for e in (EdgeClass.SHARP, EdgeClass.SMOOTH, EdgeClass.FILLET))
+FILLET = int(EdgeClass.FILLET)
 
 
 def mark_points(

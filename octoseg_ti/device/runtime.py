@@ -162,6 +162,15 @@ def workers() -> tuple[int, int]:
     return (32, _CPU_STRIDE) if on_cpu() else (1024, 1)
 
 
+def stride_of(items: int) -> int:
+    """Return the stride for a loop over coarse items, however few: threads share some 32 parts.
+
+    A kernel writes ``for u in range(items * stride): if u % stride == 0: item = u // stride``.
+    """
+    parts, stride = workers()
+    return max(min(parts, 32) * stride // max(items, 1), 1)
+
+
 def upload(array: np.ndarray) -> Any:
     """Return the array as a kernel argument: itself on the CPU, else a copy on the device."""
     array = np.ascontiguousarray(array)

@@ -252,6 +252,7 @@ def near_lists(leaves: Leaves, own: np.ndarray) -> np.ndarray:
     """
     runtime.ensure_started()
     near = runtime.empty(own.shape, np.int32)
+    # Which leaves are stale does not matter here: nothing was seen before.
     _gather(
         runtime.upload(own),
         runtime.zeros(len(own), np.int32),
@@ -324,6 +325,7 @@ class Labelling:
         shut = np.zeros(self.count, np.int32) if closed is None else closed.astype(np.int32)
         device_shut, device_surfaces = runtime.upload(shut), runtime.upload(surfaces)
         changed = self._changed(surfaces)
+        weights = self.rule._replace(noise=1.0 / self.rule.noise, tilt=1.0 / self.rule.tilt)
         for _ in range(passes):
             near, flag = runtime.empty(own.shape, np.int32), runtime.empty(len(own), np.int32)
             _gather(
@@ -335,9 +337,8 @@ class Labelling:
             own = self._own.copy()
             if len(stale):
                 held = runtime.upload(own)
-                rule = self.rule._replace(noise=1.0 / self.rule.noise, tilt=1.0 / self.rule.tilt)
                 _choose(
-                    tuple(rule), runtime.upload(stale), self.grid.point, self.grid.normal,
+                    tuple(weights), runtime.upload(stale), self.grid.point, self.grid.normal,
                     self._leaf, near, device_surfaces, held, *self.choice,
                 )  # fmt: skip
                 own = runtime.download(held)

@@ -31,7 +31,6 @@ _CLOSE, _FAR = (
 )  # a centre is found when so near its distances [mm]; it is none so far off
 _PARALLEL = 1e-6  # squared sine of the angle between surfaces below which they have no edge
 
-_SHARES = 32  # parts in which threads take tasks, however few these are
 _SHARP = 1e-9  # a smaller radius is none [mm]
 
 vec9 = ti.types.vector(9, ti.f64)
@@ -431,7 +430,7 @@ def sums(
     total = runtime.zeros((shape.shape[0] * shape.shape[1], 4), np.float64)
     if len(task):
         _sum_up(
-            max(_SHARES * runtime.workers()[1] // len(task), 1),
+            runtime.stride_of(len(task)),
             cap,
             points,
             runtime.upload(surfaces),

@@ -3,7 +3,7 @@
 import numpy as np
 
 from octoseg_ti.stages.leaves import Samples
-from octoseg_ti.stages.sets import Surfaces, apart, fit_sets, lie_on, spread
+from octoseg_ti.stages.sets import Surfaces, fit_sets, largest_gap, lie_on, spread
 from octoseg_ti.types import NONE
 
 FEWEST = 10
@@ -62,7 +62,7 @@ def refitted(
     new = lie_on(samples, sets, fitted, fits, _ON * noise, _TURN)
     old = lie_on(samples, sets, fitted, before, _ON * noise, _TURN)
     # What has hardly moved stays: nothing near it has to choose again.
-    moved = apart(samples, sets, fitted, before, fits) > _MOVED * noise
+    moved = largest_gap(samples, sets, fitted, before, fits) > _MOVED * noise
     moved |= before.kind != fits.kind
     kind, parameters = surfaces.kind.copy(), surfaces.parameters.copy()
     for k, f in enumerate(fitted):

@@ -27,7 +27,6 @@ ENDED, BEHIND, PASSED, HIDDEN = 1, 2, 4, 8
 plane of the face; no further stripe; something in the plane or in front of it, or the end of the
 field of view."""
 
-_SHARES = 32  # parts in which threads take stripes
 _LANES = 2.0  # a point of another stripe is on the same ray within so many lanes
 _SLOPE = 0.02  # the plane of a face is known so well, far from it
 _TOWARDS = 0.3  # a side is open towards the free sector within the angle of this cosine
@@ -285,8 +284,7 @@ def open_sides(lines: Lines, asked: np.ndarray, gap: float) -> np.ndarray:
     """
     runtime.ensure_started()
     side = runtime.empty(len(lines.points), np.int32)
-    # Shared between threads although stripes are few.
-    stride = max(_SHARES * runtime.workers()[1] // max(len(lines.view), 1), 1)
+    stride = runtime.stride_of(len(lines.view))
     _open_sides(
         gap, stride, runtime.upload(asked.astype(np.int32)), runtime.upload(lines.points),
         runtime.upload(lines.start), runtime.upload(lines.view), runtime.upload(lines.lane), side,

@@ -209,7 +209,7 @@ def capped_rms(
     return np.sqrt(np.bincount(owner, square, len(which)) / np.maximum(length, 1))
 
 
-def apart(
+def largest_gap(
     samples: Samples, sets: list[np.ndarray], which: np.ndarray, one: Surfaces, other: Surfaces
 ) -> np.ndarray:
     """Return how far two surfaces of every set are apart, at most, at its samples [mm].

@@ -126,3 +126,11 @@ def test_workers_do_not_depend_on_the_threads() -> None:
         for threads in (1, 3)
     }
     assert len(counts) == 1 and counts != {""}
+
+
+@pytest.mark.parametrize(("items", "stride"), [(0, 16384), (1, 16384), (32, 512), (20_000, 1)])
+def test_few_items_are_shared_between_threads_too(items: int, stride: int) -> None:
+    runtime.ensure_started()
+    if runtime.on_cpu():
+        assert runtime.stride_of(items) == stride
+    assert runtime.stride_of(items) >= 1

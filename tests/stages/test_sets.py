@@ -8,9 +8,9 @@ from reference.surfaces import CONE, CYLINDER, PLANE, SPHERE, TORUS, distance_of
 
 from octoseg_ti.stages.sets import (
     Surfaces,
-    apart,
     fit_sets,
     joined,
+    largest_gap,
     lie_on,
     nearness,
     no_surfaces,
@@ -125,14 +125,14 @@ def test_how_far_surfaces_are_apart_equals_the_reference(seed: int) -> None:
     other = Surfaces(kind=one.kind, parameters=moved)
     sets = [np.flatnonzero(rng.random(300) < share) for share in (0.3, 0.0, 0.5)]
     which = np.array([2, 0, 1, 2, 0])
-    found = apart(samples, sets, which, one, other)
+    found = largest_gap(samples, sets, which, one, other)
     for k, w in enumerate(which):
         far = [distance_of(points[sets[w]], int(KINDS[k]), p[k]) for p in (parameters, moved)]
         expected = np.max(np.abs(far[0] - far[1]), initial=0.0)
         np.testing.assert_allclose(found[k], expected, atol=1e-9)
     turned = Surfaces(kind=one.kind[:1], parameters=moved[:1].copy())
     turned.parameters[0, 3:6] *= -1.0  # the same plane, with its other side outside
-    back = apart(
+    back = largest_gap(
         samples, sets, which[:1], Surfaces(kind=one.kind[:1], parameters=moved[:1]), turned
     )
     np.testing.assert_allclose(back, 0.0, atol=1e-9)
