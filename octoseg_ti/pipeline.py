@@ -352,6 +352,10 @@ def explain_regions(
         if curved:
             measured = replace(measured, noise=min(measured.noise, scatter[0]))
     params = derive(replace(params, surfaces=asked), measured)
+    # Distances are told in noises: what single precision cannot tell counts as one.
+    rounding = 0.5 * float(np.finfo(np.float32).eps) * extent
+    noise = max(params.surfaces.noise or 0.0, rounding)
+    params = replace(params, surfaces=replace(params.surfaces, noise=noise))
     return measured, params, fit_surfaces(grid, leaves, found, params)
 
 

@@ -1,10 +1,12 @@
 """Parameters go to plain values and back, and unknown ones are named."""
 
 import json
+import math
 
+import numpy as np
 import pytest
 
-from octoseg_ti.params import PRESETS, GridParams, Params, paper
+from octoseg_ti.params import PRESETS, GridParams, NormalParams, Params, SurfaceParams, paper
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -42,3 +44,28 @@ def test_the_paper_is_literal() -> None:
         "levels", 6, 2,
     )  # fmt: skip
     assert not params.regions.assign_edges and not params.cleaning.enabled
+
+
+@pytest.mark.parametrize(
+    ("section", "values", "message"),
+    [
+        (SurfaceParams, {"noise": -0.1}, "SurfaceParams: noise must be at least 0, not -0.1"),
+        (SurfaceParams, {"tilt": 0.0}, "tilt must be above 0, not 0.0"),
+        (SurfaceParams, {"min_points": "many"}, "min_points must be at least 0, not 'many'"),
+        (GridParams, {"tolerance": 1.5}, r"tolerance must be 0\.\.1, not 1.5"),
+        (GridParams, {"divisions": 0}, "divisions must be at least 1, not 0"),
+        (NormalParams, {"gap": math.nan}, "NormalParams: gap must be at least 0, not nan"),
+        (NormalParams, {"neighbors": 2}, "neighbors must be at least 3, not 2"),
+    ],
+)
+def test_numbers_outside_their_ranges_are_refused(
+    section: type, values: dict, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        section(**values)
+
+
+def test_numbers_of_every_kind_and_the_ends_of_ranges_are_taken() -> None:
+    assert GridParams(tolerance=np.float32(1.0), divisions=np.int64(1)).divisions == 1
+    assert GridParams(tolerance=0, min_cell=math.inf).tolerance == 0
+    assert NormalParams(gap=None, neighbors=3).neighbors == 3

@@ -7,7 +7,7 @@ import pytest
 from reference.tent import make_tent
 
 from octoseg_ti import DataError, Params, Scans, Segmentation, paper, segment
-from octoseg_ti.params import PRESETS, GridParams
+from octoseg_ti.params import PRESETS, GridParams, SurfaceParams
 
 
 def check(result: Segmentation, n: int) -> None:
@@ -82,6 +82,14 @@ def test_two_places_have_no_spacing() -> None:
     given = Params(grid=GridParams(min_cell=0.5))
     check(segment(points, given), 100)
     check(segment(points, preset="paper"), 100)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_positions_said_to_be_exact_are_taken_at_the_step_of_single_precision() -> None:
+    points = np.random.default_rng(5).uniform(0.0, 10.0, (2000, 3)) * [1.0, 1.0, 0.0]
+    result = segment(points, Params(surfaces=SurfaceParams(noise=0.0)))
+    check(result, len(points))
+    assert 0.0 < result.params.surfaces.noise < 1e-5
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

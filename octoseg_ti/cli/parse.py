@@ -117,6 +117,12 @@ def _one_line(verb: str, message: str, arguments: list[str], known: list[str]) -
         r"\1 needs \2, not '\3'",
         what,
     )
+    what = what.split(". - typing.Annotated[")[0]  # how the number is declared helps nobody
+    what = re.sub(
+        r"Error parsing (\S+): \w+: (\w+) must",
+        lambda match: f"--{match[1]}.{match[2].replace('_', '-')} must",
+        what,
+    )
     given = [a.split("=")[0] for a in arguments if a.startswith("--")]
     wrong = [a for a in given if a not in known and a.replace("_", "-") not in known]
     hint = suggest(wrong[0], known) if wrong and wrong[0] in what else ""

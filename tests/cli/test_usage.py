@@ -64,7 +64,11 @@ def test_every_option_has_a_help_text(verb: str) -> None:
             ["did you mean '--params.grid.tolerance'"],
         ),
         (["segment", "a.npz", "-o", "c.npz", "--preset", "papr"], ["papr", "paper"]),
-        (["segment", "a.npz", "-o", "c.npz", "--params.grid.tolerance", "x"], ["FLOAT", "x"]),
+        (["segment", "a.npz", "-o", "c.npz", "--params.grid.tolerance", "x"], ["FLOAT, not 'x';"]),
+        (
+            ["segment", "a.npz", "-o", "c.npz", "--params.surfaces.noise", "-1"],
+            ["--params.surfaces.noise must be at least 0, not -1"],
+        ),
         (["segment", "a.npz", "-o", "c.npz", "--arch", "gpu"], ["gpu", "vulkan"]),
         (["segment", __file__, "-o", "c.docx"], [".docx", ".mcap"]),
         (["segment", __file__, "-o", "c.npz", "--threads", "0"], ["--threads", "at least 1"]),
