@@ -16,7 +16,7 @@ import numpy as np
 import platformdirs
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-from octoseg_ti.device import launching, tracing
+from octoseg_ti.device import affinity, launching, tracing
 
 with tracing.quick_import():
     import taichi as ti
@@ -88,7 +88,7 @@ def start(
     if threads is not None and threads < 1:
         raise ValueError(f"threads must be at least 1, not {threads}")
     wanted = Options(
-        arch=arch, threads=threads or os.cpu_count() or 1, debug=debug, profile=profile
+        arch=arch, threads=threads or affinity.processors(), debug=debug, profile=profile
     )
     if _started is not None:
         if _started != wanted:
@@ -96,7 +96,8 @@ def start(
         return _started
     overruled = os.environ.pop("TI_ARCH", None)  # would replace our arch without a word
     try:
-        with contextlib.redirect_stdout(io.StringIO()):
+        apart = affinity.kept_apart(wanted.threads if arch == "cpu" else 1)
+        with contextlib.redirect_stdout(io.StringIO()), apart:
             ti.init(
                 arch=getattr(ti, arch),
                 enable_fallback=False,
