@@ -7,6 +7,7 @@ each argument is handed over, and the compiled kernel. Whatever does not fit the
 way, where Taichi says what is wrong with it.
 """
 
+import ctypes
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 
 _INTEGERS, _REALS = (int, np.integer), (int, float, np.integer, np.floating)
 _LARGEST = 2**31 - 1  # elements of an array: Taichi counts them in 32 bits
+_BYTE_OF: Any = ctypes.c_char.from_buffer
 _MOST = 60  # arguments, vectors by their elements; Taichi takes 64
 
 
@@ -22,6 +24,13 @@ class _Plan(NamedTuple):
     compiled: Any
     setters: tuple[Callable[[Any, tuple[int, ...], Any], bool], ...]
     """One an argument: hands it over, or says that it does not fit."""
+
+
+def _address(array: np.ndarray) -> int:
+    """Return where the elements of an array are; by way of a buffer that takes a fifth as long."""
+    if array.size and array.flags.writeable:
+        return ctypes.addressof(_BYTE_OF(array))
+    return int(array.__array_interface__["data"][0])
 
 
 def _array_setter(dtype: np.dtype, ndim: int) -> Callable[[Any, tuple[int, ...], Any], bool]:
@@ -35,7 +44,7 @@ def _array_setter(dtype: np.dtype, ndim: int) -> Callable[[Any, tuple[int, ...],
         ):
             return False
         context.set_arg_external_array_with_shape(
-            index, value.__array_interface__["data"][0], value.nbytes, value.shape, 0
+            index, _address(value), value.nbytes, value.shape, 0
         )
         return True
 

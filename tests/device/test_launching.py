@@ -61,6 +61,23 @@ def test_by_plan_and_by_the_long_way(seed: int) -> None:
     assert _mix._primal.octoseg_plan[1] is not None
 
 
+def test_arrays_read_only_empty_and_within_others_are_launched_by_plan() -> None:
+    runtime.ensure_started()
+    _mix(*arguments(4, 0))
+    values = arguments(9, 3)
+    y, i = expected(values)
+    values[4].flags.writeable = False
+    values[5].flags.writeable = False
+    for k in (4, 5, 6, 7):
+        values[k] = values[k][2:6]
+    _mix(*values)
+    np.testing.assert_array_equal(values[6], y[2:6])
+    np.testing.assert_array_equal(values[7], i[2:6])
+    for k in (4, 5, 6, 7):
+        values[k] = values[k][:0]
+    _mix(*values)
+
+
 @pytest.mark.parametrize(
     ("place", "wrong"),
     [
