@@ -118,15 +118,25 @@ def _one_line(verb: str, message: str, arguments: list[str], known: list[str]) -
         what,
     )
     what = what.split(". - typing.Annotated[")[0]  # how the number is declared helps nobody
-    what = re.sub(
-        r"Error parsing (\S+): \w+: (\w+) must",
-        lambda match: f"--{match[1]}.{match[2].replace('_', '-')} must",
-        what,
-    )
+    refused = re.fullmatch(r"Error parsing (\S+): \w+: (\w+) (must .*, not) (\S+)", what)
+    if refused:
+        option = _option_of(refused[1], refused[2], known)
+        value = refused[4]
+        if option.endswith("-deg"):
+            value = f"{math.degrees(float(value)):.9g}"
+        what = f"{option} {refused[3]} {value}"
     given = [a.split("=")[0] for a in arguments if a.startswith("--")]
     wrong = [a for a in given if a not in known and a.replace("_", "-") not in known]
     hint = suggest(wrong[0], known) if wrong and wrong[0] in what else ""
     return f"{verb}: {what}{hint}; see octoseg {verb} --help"
+
+
+def _option_of(section: str, field: str, known: list[str]) -> str:
+    """Return the option that a field of a section is given by: the names of some are short."""
+    dashed = field.replace("_", "-")
+    full = f"--{section}.{dashed}"
+    names = [name + unit for name in (full, f"--{dashed}") for unit in ("", "-deg")]
+    return next((name for name in names if name in known), full)
 
 
 def _names(options: type, prefix: str = "--") -> list[str]:

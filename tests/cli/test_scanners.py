@@ -32,7 +32,7 @@ def test_a_scanner_by_name_and_its_options_over_it() -> None:
     [
         (["--scanner", "surveyer"], ["surveyer", "surveyor-like"]),
         (["--scanner"], ["--scanner"]),
-        (["--scanner", "harsh", "--sub-rays", "4"], ["sub_rays", "odd"]),
+        (["--scanner", "harsh", "--sub-rays", "4"], ["--sub-rays must be an odd number", "not 4"]),
         (["--specle", "1"], ["did you mean '--speckle'"]),
     ],
 )

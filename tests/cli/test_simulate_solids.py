@@ -61,4 +61,4 @@ def test_a_missing_file_and_an_impossible_option(octoseg, tmp_path: Path) -> Non
     outcome = octoseg("simulate", tmp_path / "cubes.stl", "-o", tmp_path / "scan.mcap")
     assert outcome.code == 1 and "did you mean 'cube.stl'" in outcome.complaint
     outcome = octoseg("simulate", source, "-o", tmp_path / "s.npz", "--smooth-angle-deg", "-3")
-    assert outcome.code == 2 and "smooth_angle" in outcome.complaint
+    assert outcome.code == 2 and "--smooth-angle-deg must be above 0, not -3;" in outcome.complaint
