@@ -19,6 +19,7 @@ from octoseg_ti.types import NONE
 _ROUNDS = 3
 _BEND = -2  # the label of cells that have none and lie on a bend
 
+ivec2: Any = ti.types.vector(2, ti.i32)
 ivec3: Any = ti.types.vector(3, ti.i32)
 ivec4: Any = ti.types.vector(4, ti.i32)
 near_cells: Any = ti.types.vector(27, ti.i32)
@@ -88,7 +89,7 @@ def _choose(
 
 @ti.kernel
 def _join(
-    rounds: ti.i32,
+    loops: ivec2,
     rule: vec3,
     boxes: ivec4,
     # In:
@@ -105,35 +106,40 @@ def _join(
 ):
     """Label the points of some cells, run by run of points in one smallest box.
 
+    The loops hold how many rounds of cells are looked at, and the stride over the cells asked for.
     The rule holds the largest distance from the plane, that distance on a bend where the normals
     differ, and the cosine from which they do not.
     """
-    for u in asked_in:
-        own = asked_in[u]
-        level = boxes[3] - node_in[own, LEVEL]
-        bend = ti.select(cell_label_in[own] == _BEND, own, -1)
-        near = near_cells(-1)
-        end = node_in[own, HI]
-        lo = node_in[own, LO]
-        while lo < end:
-            key = key_in[lo]
-            at = ivec3(compacted(key, 0), compacted(key, 1), compacted(key, 2))
-            hi = lo
-            left = 1
-            reach = 1
-            while left > 0 and reach <= rounds:
-                left = 0
-                count = _collect(at, level, reach, boxes, root_in, child_in, cell_label_in, near)
+    rounds, stride = loops[0], loops[1]
+    for u in range(asked_in.shape[0] * stride):
+        if u % stride == 0:
+            own = asked_in[u // stride]
+            level = boxes[3] - node_in[own, LEVEL]
+            bend = ti.select(cell_label_in[own] == _BEND, own, -1)
+            near = near_cells(-1)
+            end = node_in[own, HI]
+            lo = node_in[own, LO]
+            while lo < end:
+                key = key_in[lo]
+                at = ivec3(compacted(key, 0), compacted(key, 1), compacted(key, 2))
                 hi = lo
-                while hi < end and key_in[ti.min(hi, end - 1)] == key:
-                    if label_inout[hi] < 0:
-                        p = row(point_in, hi)
-                        found = _choose(p, bend, rule, count, near, mean_in, cell_label_in)
-                        label_inout[hi] = found
-                        left += ti.cast(found < 0, ti.i32)
-                    hi += 1
-                reach += 1
-            lo = hi
+                left = 1
+                reach = 1
+                while left > 0 and reach <= rounds:
+                    left = 0
+                    count = _collect(
+                        at, level, reach, boxes, root_in, child_in, cell_label_in, near
+                    )
+                    hi = lo
+                    while hi < end and key_in[ti.min(hi, end - 1)] == key:
+                        if label_inout[hi] < 0:
+                            p = row(point_in, hi)
+                            found = _choose(p, bend, rule, count, near, mean_in, cell_label_in)
+                            label_inout[hi] = found
+                            left += ti.cast(found < 0, ti.i32)
+                        hi += 1
+                    reach += 1
+                lo = hi
 
 
 def places_of_rows(grid: Grid, row: np.ndarray, rows: int) -> np.ndarray:
@@ -225,7 +231,7 @@ def assign_points(
         return label
     label = runtime.upload(label)
     _join(
-        rounds,
+        (rounds, runtime.stride_of(int(np.count_nonzero(asked)))),
         (limit, tight, float(np.cos(angle))),
         (*grid.shape, grid.depth),
         runtime.upload(leaves[asked].astype(np.int32)),

@@ -32,11 +32,45 @@ def _fixed(x: ti.f64) -> ti.i64:
     return ti.cast(x * _ONE + ti.select(x < 0.0, -0.5, 0.5), ti.i64)
 
 
+_sums = ti.types.vector(COUNT, ti.i64)
+
+
+@ti.func
+def _sums_of(
+    first: ti.i32,
+    end: ti.i32,
+    middle: vec3,
+    size: ti.f64,
+    signed: ti.i32,
+    point: ti.template(),
+    normal: ti.template(),
+) -> _sums:
+    """Return the moments of some of the points of a cell."""
+    sums = _sums(0)
+    sums[0] = ti.cast(end - first, ti.i64)
+    for i in range(first, end):
+        n = row(normal, i)
+        p = (row(point, i) - middle) * (2.0 / size)
+        for k in ti.static(range(3)):
+            sums[1 + k] += _fixed(n[k])
+            sums[10 + k] += _fixed(p[k])
+        if signed == 1:
+            # With a side, only the trace of sum N N' is used: how many have a normal.
+            sums[4] += _fixed(n.norm_sqr())
+        else:
+            for k in ti.static(range(6)):
+                sums[4 + k] += _fixed(n[ti.static(_ROW[k])] * n[ti.static(_COLUMN[k])])
+        for k in ti.static(range(6)):
+            sums[13 + k] += _fixed(p[ti.static(_ROW[k])] * p[ti.static(_COLUMN[k])])
+    return sums
+
+
 @ti.kernel
 def _accumulate(
     first: ti.i32,
     last: ti.i32,
     slices: ti.i32,
+    stride: ti.i32,
     signed: ti.i32,
     size: ti.f64,
     # In:
@@ -47,44 +81,28 @@ def _accumulate(
     moment_inout: I64Rows,
 ):
     """Add up the moments of the nodes first..last-1, one level, in slices of the sorted points."""
-    for u in range(slices):
-        i = u * _SLICE
-        end = ti.min(i + _SLICE, point_in.shape[0])
-        c = first  # the first node of the level that ends after i
-        high = last
-        while c < high:
-            middle = (c + high) // 2
-            if node_in[middle, HI] > i:
-                high = middle
-            else:
-                c = middle + 1
-        while c < last and i < end:
-            i = ti.max(i, node_in[c, LO])
-            stop = ti.min(end, node_in[c, HI])
-            middle = size * (vec3(node_in[c, X], node_in[c, Y], node_in[c, Z]) + 0.5)
-            if i < stop:
-                sums = ti.Vector([ti.i64(0)] * COUNT)
-                sums[0] = ti.cast(stop - i, ti.i64)
-                while i < stop:
-                    n = row(normal_in, i)
-                    p = (row(point_in, i) - middle) * (2.0 / size)
-                    for k in ti.static(range(3)):
-                        sums[1 + k] += _fixed(n[k])
-                        sums[10 + k] += _fixed(p[k])
-                    if signed == 1:
-                        # With a side, only the trace of sum N N' is used: how many have a normal.
-                        sums[4] += _fixed(n.norm_sqr())
-                    else:
-                        for k in ti.static(range(6)):
-                            a, b = ti.static(_ROW[k]), ti.static(_COLUMN[k])
-                            sums[4 + k] += _fixed(n[a] * n[b])
-                    for k in ti.static(range(6)):
-                        a, b = ti.static(_ROW[k]), ti.static(_COLUMN[k])
-                        sums[13 + k] += _fixed(p[a] * p[b])
-                    i += 1
-                for k in ti.static(range(COUNT)):
-                    ti.atomic_add(moment_inout[c, k], sums[k])
-            c += 1
+    for u in range(slices * stride):
+        if u % stride == 0:
+            i = u // stride * _SLICE
+            end = ti.min(i + _SLICE, point_in.shape[0])
+            c = first  # the first node of the level that ends after i
+            high = last
+            while c < high:
+                middle = (c + high) // 2
+                if node_in[middle, HI] > i:
+                    high = middle
+                else:
+                    c = middle + 1
+            while c < last and i < end:
+                i = ti.max(i, node_in[c, LO])
+                stop = ti.min(end, node_in[c, HI])
+                if i < stop:
+                    centre = size * (vec3(node_in[c, X], node_in[c, Y], node_in[c, Z]) + 0.5)
+                    sums = _sums_of(i, stop, centre, size, signed, point_in, normal_in)
+                    for k in ti.static(range(COUNT)):
+                        ti.atomic_add(moment_inout[c, k], sums[k])
+                    i = stop
+                c += 1
 
 
 @ti.func
@@ -158,7 +176,8 @@ def add_up(
     """
     runtime.ensure_started()
     slices = -(-point.shape[0] // _SLICE)
-    _accumulate(first, last, slices, int(signed), size, node, point, normal, moment)
+    stride = runtime.stride_of(slices)
+    _accumulate(first, last, slices, stride, int(signed), size, node, point, normal, moment)
 
 
 def point_sums(moment: np.ndarray, off: np.ndarray, size: np.ndarray) -> np.ndarray:
