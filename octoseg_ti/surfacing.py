@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -12,10 +13,9 @@ from octoseg_ti.params import Params
 from octoseg_ti.patches import Regions, relabelled
 from octoseg_ti.stages.extraction import Tolerance
 from octoseg_ti.stages.grid import Grid
-from octoseg_ti.stages.labelling import Labelling, Rule, common_label, label_lists, surface_table
+from octoseg_ti.stages.labelling import Labelling, Rule, label_lists, surface_table
 from octoseg_ti.stages.leaves import Leaves, leaf_graph
-from octoseg_ti.stages.merging import mean_squares
-from octoseg_ti.stages.pieces import entry_boxes, pieces
+from octoseg_ti.stages.pieces import Entries, measure_entries, names_of_points, pieces
 from octoseg_ti.stages.settling import settle
 from octoseg_ti.surface_search import AROUND, EXPLAINED, FREE, NARROW, Surfaced, find_surfaces
 from octoseg_ti.types import NONE
@@ -53,9 +53,8 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         Tolerance(noise, turn, fewest, exact), rule, narrow=exact,
         limit=params.edges.fillet_radius,
     )  # fmt: skip
-    gap = params.normals.gap
-    piece = connected_pieces(runtime.download(grid.point), graph, surfaced, gap)
-    label, surface = number_pieces(graph, surfaced, piece, least, fewest)
+    piece, entries = connected_pieces(grid.point, graph, surfaced, params.normals.gap)
+    label, surface = number_pieces(graph, surfaced, entries, piece, least, fewest)
     label, surface, free = _with_free_forms(label, surface, found, least)
     if len(surface):
         table = surface_table(
@@ -145,29 +144,36 @@ def _with_free_forms(
 
 
 def connected_pieces(
-    points: np.ndarray, leaves: Leaves, found: Surfaced, gap: float | None
-) -> np.ndarray:
-    """Return the connected pieces of the surfaces, as `pieces` does.
+    points: Any, leaves: Leaves, found: Surfaced, gap: float | None
+) -> tuple[np.ndarray, Entries]:
+    """Return the connected pieces of the surfaces, as `pieces` does, and the points in each leaf.
 
     Args:
-        points: Sorted positions [mm], shape (n, 3), f64.
+        points: Sorted positions [mm], shape (n, 3), f64 (kernel array).
         leaves: The leaves.
         found: The surfaces and their points.
         gap: The longest edge of a triangle [mm]; pieces are no farther apart than a few of these.
             None = not known.
     """
-    box = entry_boxes(points, leaves, found.own, found.label)
-    return pieces(leaves, found.own, box, np.inf if gap is None else PIECE_GAPS * gap)
+    entries = measure_entries(points, leaves, found.own, found.label, found.off, _CAP)
+    farthest = np.inf if gap is None else PIECE_GAPS * gap
+    return pieces(leaves, found.own, entries.box, farthest), entries
 
 
 def number_pieces(
-    leaves: Leaves, found: Surfaced, piece: np.ndarray, least: float, fewest: float
+    leaves: Leaves,
+    found: Surfaced,
+    entries: Entries,
+    piece: np.ndarray,
+    least: float,
+    fewest: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Number the connected pieces of the surfaces by size.
 
     Args:
         leaves: The leaves.
         found: The surfaces and their points.
+        entries: Their points in every leaf (`measure_entries`).
         piece: Piece of every entry of their lists (`pieces`), shape (C, most), i32.
         least: A piece with fewer points is no patch, nor is one that other surfaces explain,
         fewest: unless it is the largest of its surface and has so many.
@@ -175,28 +181,19 @@ def number_pieces(
     Returns:
         Patch of every sorted point, -1 = none, shape (n,), i32; and the surface of every patch.
     """
-    mine = np.repeat(piece[:, 0], leaves.count)
-    # Where a leaf holds nothing but its first surface, all of its points are of that piece.
-    mixed = (found.own[:, 1] >= 0) | (common_label(leaves, found.label) < 0)
-    (others,) = np.nonzero(np.repeat(mixed, leaves.count))
-    cell = np.repeat(np.flatnonzero(mixed), leaves.count[mixed])
-    rank = (found.own[cell] == found.label[others, None]).argmax(axis=1)
-    mine[others] = np.where(found.label[others] < 0, NONE, piece[cell, rank])
-    there = mine >= 0
-    mine = mine[there]
-    size = np.bincount(mine)
-    surface = found.own[found.own >= 0][: len(size)]  # pieces are named by an entry of the lists
+    there = found.own >= 0
+    surface, mine = found.own[there], piece[there]  # pieces are named by one of their entries
+    size = np.bincount(mine, entries.size, len(mine)).astype(np.int64)
     most = np.zeros(len(found.surfaces), np.int64)
     np.maximum.at(most, surface, size)
     main = (size > 0) & (size == most[surface])
     # Where surfaces touch smoothly one goes on within the other, and gets some of its points.
-    (square,) = mean_squares(mine, found.off[there], (_CAP,), size, np.zeros_like(size))
+    square = np.bincount(mine, entries.square, len(mine)) / np.maximum(size, 1)
     within = square <= EXPLAINED
     kept = size >= np.where(main, max(fewest, 1), max(least, 1))
     names = np.flatnonzero(kept & (main | ~within))
     names = names[np.argsort(-size[names], kind="stable")]
     number = np.full(len(size), NONE, np.int32)
     number[names] = np.arange(len(names), dtype=np.int32)
-    label = np.full(len(found.label), NONE, np.int32)
-    label[there] = number[mine]
+    label = names_of_points(leaves, found.own, found.label, number[mine])
     return label, surface[names]

@@ -9,9 +9,9 @@ from reference.device_grid import surface_leaves
 from reference.leaves import leaves_of
 
 from octoseg_ti import Scans, SurfaceKind, segment
+from octoseg_ti.device import runtime
 from octoseg_ti.stages.labelling import label_lists
 from octoseg_ti.stages.leaves import Leaves
-from octoseg_ti.stages.pieces import pieces
 from octoseg_ti.stages.sets import Surfaces
 from octoseg_ti.surface_search import EXPLAINED, FREE, Surfaced
 from octoseg_ti.surfacing import _with_free_forms, connected_pieces, number_pieces
@@ -40,8 +40,9 @@ def band(ends: list[float], names: list[int]) -> tuple[Leaves, np.ndarray, np.nd
 def numbered(
     leaves: Leaves, found: Surfaced, least: float, fewest: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    boxes = np.zeros((np.count_nonzero(found.own >= 0), 6))  # none too far from another
-    return number_pieces(leaves, found, pieces(leaves, found.own, boxes, np.inf), least, fewest)
+    points = runtime.upload(np.zeros((len(found.label), 3)))  # none too far from another
+    piece, entries = connected_pieces(points, leaves, found, None)
+    return number_pieces(leaves, found, entries, piece, least, fewest)
 
 
 def plain_numbers(
@@ -221,5 +222,5 @@ def test_stripes_that_graze_a_face_are_one_piece(apart: float, count: int) -> No
     points = np.column_stack([x, y, 0.0 * x])[np.abs(x - 4.0) > apart / 2.0]
     leaves, order = leaves_of(points, 2.0)
     found = surfaced(leaves, np.zeros(len(points)), np.full(len(points), 9.0), 1)
-    piece = connected_pieces(points[order], leaves, found, 0.5)
+    piece, _ = connected_pieces(runtime.upload(points[order]), leaves, found, 0.5)
     assert len(np.unique(piece[found.own >= 0])) == count

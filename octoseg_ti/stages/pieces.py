@@ -1,14 +1,89 @@
 """Connected pieces of surfaces, over the leaves in which these have points."""
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from octoseg_ti.device import runtime
-from octoseg_ti.device.linalg import vec3
-from octoseg_ti.device.runtime import F64Rows, I32Array, I32Rows, ti
+from octoseg_ti.device.linalg import row, vec3
+from octoseg_ti.device.runtime import F32Array, F64Rows, I32Array, I32Rows, I64Array, ti
 from octoseg_ti.device.unionfind import roots, unite
-from octoseg_ti.stages.labelling import MOST, common_label
-from octoseg_ti.stages.leaves import Leaves, ranges
+from octoseg_ti.stages.labelling import MOST
+from octoseg_ti.stages.leaves import Leaves
 from octoseg_ti.types import NONE
+
+# Squares are added up in whole units, so that the sum does not depend on the order of the points.
+_UNIT = 1024.0
+
+
+class Entries(NamedTuple):
+    """The points of every surface in every leaf: one row an entry of the lists, row by row."""
+
+    box: np.ndarray
+    """Their lower and upper corner [mm], shape (k, 6)."""
+    size: np.ndarray
+    """How many there are, shape (k,), i32."""
+    square: np.ndarray
+    """Sum of the squares of how far they are from the surface that would be next, shape (k,)."""
+
+
+@ti.func
+def _entry_of(own: ti.template(), first: ti.template(), c: ti.i32, s: ti.i32) -> ti.i32:
+    """Return the entry of a surface in the list of a leaf, -1 where it is not in the list."""
+    k = 0
+    while k < MOST and own[c, k] != s:
+        k += 1
+    return ti.select(s >= 0 and k < MOST, first[c] + k, -1)
+
+
+@ti.kernel
+def _measure_entries(
+    cap: ti.f64,
+    # In:
+    leaf_in: I32Rows,
+    own_in: I32Rows,
+    first_in: I32Array,
+    label_in: I32Array,
+    point_in: F64Rows,
+    off_in: F32Array,
+    # Out:
+    box_inout: F64Rows,
+    size_inout: I32Array,
+    square_inout: I64Array,
+):
+    """Add the points of every leaf to its entries."""
+    for c in first_in:
+        for i in range(leaf_in[c, 0], leaf_in[c, 0] + leaf_in[c, 1]):
+            e = _entry_of(own_in, first_in, c, label_in[i])
+            if e >= 0:
+                p = row(point_in, i)
+                for k in ti.static(range(3)):
+                    box_inout[e, k] = ti.min(box_inout[e, k], p[k])
+                    box_inout[e, 3 + k] = ti.max(box_inout[e, 3 + k], p[k])
+                off = ti.min(ti.cast(off_in[i], ti.f64), cap)
+                size_inout[e] = size_inout[e] + 1
+                square_inout[e] = square_inout[e] + ti.cast(_UNIT * off * off + 0.5, ti.i64)
+
+
+@ti.kernel
+def _name_points(
+    # In:
+    leaf_in: I32Rows,
+    own_in: I32Rows,
+    first_in: I32Array,
+    label_in: I32Array,
+    name_in: I32Array,
+    # Out:
+    name_out: I32Array,
+):
+    """Write the name that the entry of every point has, -1 for points of none."""
+    for c in first_in:
+        for i in range(leaf_in[c, 0], leaf_in[c, 0] + leaf_in[c, 1]):
+            e = _entry_of(own_in, first_in, c, label_in[i])
+            name = NONE
+            if e >= 0:
+                name = name_in[e]
+            name_out[i] = name
 
 
 @ti.func
@@ -57,7 +132,7 @@ def pieces(leaves: Leaves, own: np.ndarray, box: np.ndarray, gap: float) -> np.n
         leaves: The leaves.
         own: Surfaces with points in every leaf, ascending, then -1; shape (C, MOST), i32.
         box: Lower and upper corner of the points of every entry that is one, row by row [mm], shape
-            (k, 6), by `entry_boxes`.
+            (k, 6), by `measure_entries`.
         gap: Largest distance of the boxes of two entries of one piece [mm].
 
     Returns:
@@ -66,13 +141,12 @@ def pieces(leaves: Leaves, own: np.ndarray, box: np.ndarray, gap: float) -> np.n
     """
     runtime.ensure_started()
     there = own >= 0
-    held = np.count_nonzero(there, axis=1)
     parent = runtime.upload(np.arange(len(box), dtype=np.int32))
     if len(leaves.a) and len(box):
         _join_pieces(
             gap,
             runtime.upload(own),
-            runtime.upload((np.cumsum(held) - held).astype(np.int32)),
+            _first_entries(own),
             runtime.upload(box),
             runtime.upload(leaves.a),
             runtime.upload(leaves.b),
@@ -83,35 +157,61 @@ def pieces(leaves: Leaves, own: np.ndarray, box: np.ndarray, gap: float) -> np.n
     return piece
 
 
-def entry_boxes(
-    points: np.ndarray, leaves: Leaves, own: np.ndarray, label: np.ndarray
-) -> np.ndarray:
-    """Return the box around the points of every surface in every leaf [mm], shape (k, 6).
+def measure_entries(
+    points: Any, leaves: Leaves, own: np.ndarray, label: np.ndarray, off: np.ndarray, cap: float
+) -> Entries:
+    """Return what the points of every surface in every leaf are.
 
     Args:
-        points: Sorted positions [mm], shape (n, 3), f64.
+        points: Sorted positions [mm], shape (n, 3), f64 (kernel array).
         leaves: The leaves.
-        own: Surfaces with points in every leaf, ascending, then -1; shape (C, most), i32.
+        own: Surfaces with points in every leaf, ascending, then -1; shape (C, MOST), i32.
         label: Surface of every sorted point, -1 = none, shape (n,), i32.
-
-    Returns:
-        Lower and upper corner for every entry of ``own`` that is one, row by row.
+        off: How far it is from the surface that would be next, 0 or more, shape (n,), f32.
+        cap: No distance counts for more.
     """
-    cell, rank = np.nonzero(own >= 0)
-    width = np.int64(own.max(initial=0)) + 1
-    key = cell * width + own[cell, rank]
-    box = leaves.box[cell].copy()
-    several = np.flatnonzero((own[:, 1] >= 0) | (common_label(leaves, label) < 0))
-    count = leaves.count[several]
-    mine = ranges(leaves.first[several], count)
-    name = np.repeat(several, count) * width + label[mine]
-    mine, name = mine[label[mine] >= 0], name[label[mine] >= 0]
-    order = np.argsort(name, kind="stable")
-    mine, name = mine[order], name[order]
-    first = np.flatnonzero(np.diff(name, prepend=-1))
-    at = np.minimum(np.searchsorted(key, name[first]), max(len(key) - 1, 0))
-    held = key[at] == name[first]  # the lists have an end
-    low = np.minimum.reduceat(points[mine], first, axis=0) if len(first) else np.zeros((0, 3))
-    high = np.maximum.reduceat(points[mine], first, axis=0) if len(first) else np.zeros((0, 3))
-    box[at[held]] = np.concatenate([low, high], axis=1)[held]
-    return box
+    runtime.ensure_started()
+    count = int(np.count_nonzero(own >= 0))
+    box = np.empty((count, 6))
+    box[:, :3], box[:, 3:] = np.inf, -np.inf
+    kept = runtime.upload(box), runtime.zeros(count, np.int32), runtime.zeros(count, np.int64)
+    if count:
+        _measure_entries(
+            cap, _table(leaves), runtime.upload(own), _first_entries(own), runtime.upload(label),
+            points, runtime.upload(off), *kept,
+        )  # fmt: skip
+    box, size, square = (runtime.download(array)[:count] for array in kept)
+    return Entries(box, size, square / _UNIT)
+
+
+def names_of_points(
+    leaves: Leaves, own: np.ndarray, label: np.ndarray, name: np.ndarray
+) -> np.ndarray:
+    """Return the name that the entry of every point has, -1 for points of none; shape (n,), i32.
+
+    Args:
+        leaves: The leaves.
+        own: Surfaces with points in every leaf, ascending, then -1; shape (C, MOST), i32.
+        label: Surface of every sorted point, -1 = none, shape (n,), i32.
+        name: A name for every entry of ``own``, row by row, shape (k,), i32.
+    """
+    runtime.ensure_started()
+    if len(name) == 0:
+        return np.full(len(label), NONE, np.int32)
+    named = runtime.empty(len(label), np.int32)
+    _name_points(
+        _table(leaves), runtime.upload(own), _first_entries(own), runtime.upload(label),
+        runtime.upload(name), named,
+    )  # fmt: skip
+    return runtime.download(named)
+
+
+def _table(leaves: Leaves) -> Any:
+    """Return first point and number of points of every leaf, for kernels."""
+    return runtime.upload(np.stack([leaves.first, leaves.count], axis=1))
+
+
+def _first_entries(own: np.ndarray) -> Any:
+    """Return the first entry of every leaf, for kernels."""
+    held = np.count_nonzero(own >= 0, axis=1)
+    return runtime.upload((np.cumsum(held) - held).astype(np.int32))

@@ -9,7 +9,7 @@ from reference.leaves import leaves_of
 from octoseg_ti.device import runtime
 from octoseg_ti.stages.labelling import label_lists, own_lists
 from octoseg_ti.stages.leaves import Leaves
-from octoseg_ti.stages.pieces import entry_boxes, pieces
+from octoseg_ti.stages.pieces import measure_entries, names_of_points, pieces
 
 
 def random_own(leaves: Leaves, seed: int, count: int) -> np.ndarray:
@@ -50,15 +50,22 @@ def test_points_of_one_piece_are_no_farther_apart_than_the_gap(seed: int, gap: f
     label = rng.integers(-1, 2, len(leaves))[leaf]
     label = np.where(rng.random(900) < 0.2, rng.integers(-1, 3, 900), label).astype(np.int32)
     own = label_lists(leaves, label)
-    box = entry_boxes(point, leaves, own, label)
+    off = rng.uniform(0.0, 6.0, 900).astype(np.float32)
+    entries = measure_entries(grid.point, leaves, own, label, off, 4.0)
     points = {
         (c, s): point[(leaf == c) & (label == s)] for c, m in enumerate(as_lists(own)) for s in m
     }
     expected = np.array([[*p.min(axis=0), *p.max(axis=0)] for p in points.values()])
-    assert np.all(box[:, :3] <= expected[:, :3]) and np.all(box[:, 3:] >= expected[:, 3:])
-    several = np.array([np.ptp(label[leaf == c]) > 0 for c, _ in points])
-    np.testing.assert_array_equal(box[several], expected[several])
-    found = as_lists(pieces(leaves, own, box, gap))
+    np.testing.assert_array_equal(entries.box, expected)
+    assert entries.size.tolist() == [len(p) for p in points.values()]
+    squares = [np.minimum(off[(leaf == c) & (label == s)], 4.0) ** 2 for c, s in points]
+    units = [np.rint(1024.0 * np.float64(v) ** 2).sum() for v in map(np.sqrt, squares)]
+    np.testing.assert_allclose(entries.square, np.array(units) / 1024.0, atol=1e-2)
+    name = rng.integers(0, 99, len(points)).astype(np.int32)
+    of = dict(zip(points, name.tolist(), strict=True))
+    named = [of.get((c, s), -1) for c, s in zip(leaf.tolist(), label.tolist(), strict=True)]
+    assert names_of_points(leaves, own, label, name).tolist() == named
+    found = as_lists(pieces(leaves, own, entries.box, gap))
     assert found == meeting.pieces(as_lists(own), pairs_of(leaves), points, gap)
 
 
@@ -72,11 +79,31 @@ def test_a_large_leaf_with_a_stray_point_links_nothing() -> None:
     own = label_lists(leaves, label)
     assert [row[row >= 0].tolist() for row in own] == [[0], [0, 1], [0]]
     assert len(np.unique(pieces(leaves, own, no_boxes(own), np.inf)[own == 0])) == 1
-    near = pieces(leaves, own, entry_boxes(points, leaves, own, label), 1.0)
+    off = np.zeros(len(points), np.float32)
+    entries = measure_entries(runtime.upload(points), leaves, own, label, off, 1.0)
+    near = pieces(leaves, own, entries.box, 1.0)
     assert len(np.unique(near[own == 0])) == 2
 
 
 def test_without_surfaces_there_are_no_pieces() -> None:
     _, leaves = surface_leaves(0, 900)
-    own = label_lists(leaves, np.full(900, -1, np.int32))
+    label = np.full(900, -1, np.int32)
+    own = label_lists(leaves, label)
     assert np.all(pieces(leaves, own, no_boxes(own), 1.0) == -1)
+    entries = measure_entries(runtime.zeros((900, 3), float), leaves, own, label, label, 1.0)
+    assert len(entries.size) == 0
+    assert np.all(names_of_points(leaves, own, label, np.zeros(0, np.int32)) == -1)
+
+
+def test_what_a_full_list_leaves_out_is_of_no_entry() -> None:
+    points = np.column_stack([np.linspace(0.1, 0.9, 40), np.zeros((40, 2))])
+    leaves, _ = leaves_of(points, 1.0)
+    label = (np.arange(40) % 20).astype(np.int32)
+    own = label_lists(leaves, label)
+    held = own[own >= 0]
+    assert len(leaves) == 1 and len(held) < 20
+    off = np.ones(40, np.float32)
+    entries = measure_entries(runtime.upload(points), leaves, own, label, off, 4.0)
+    assert entries.size.tolist() == [2] * len(held) and np.all(entries.square == 2.0)
+    named = names_of_points(leaves, own, label, np.arange(len(held), dtype=np.int32))
+    np.testing.assert_array_equal(named, np.where(np.isin(label, held), label, -1))
