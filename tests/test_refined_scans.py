@@ -15,7 +15,7 @@ import pytest
 from octoseg_ti import Params, evaluate, segment
 from octoseg_ti.evaluation import pose_errors
 from octoseg_ti.params import RegistrationParams
-from octoseg_ti.types import Scans, Truth
+from octoseg_ti.types import Scans, Segmentation, Truth
 from scanner_sim import StripeScanner, View, blocks, simulate
 from scanner_sim.scanner import around
 
@@ -54,9 +54,16 @@ def small() -> tuple[Scans, Truth]:
     return simulate(part, replace(SCANNER, views=views, points=12_000), seed=4)
 
 
-def test_what_was_not_asked_for_is_not_done(small: tuple[Scans, Truth]) -> None:
+@pytest.fixture(scope="module")
+def refined(small: tuple[Scans, Truth]) -> Segmentation:
+    return segment(small[0], REFINE)
+
+
+def test_what_was_not_asked_for_is_not_done(
+    small: tuple[Scans, Truth], refined: Segmentation
+) -> None:
     scans, _ = small
-    plain, refined = segment(scans), segment(scans, REFINE)
+    plain = segment(scans)
     assert plain.registration is None and "registration" not in str(plain).split("milli")[0]
     assert refined.registration is not None
     np.testing.assert_array_equal(refined.registration.recorded, scans.T_world_view)
@@ -74,13 +81,15 @@ def test_what_was_not_asked_for_is_not_done(small: tuple[Scans, Truth]) -> None:
     np.testing.assert_allclose(refined.normals, turned, atol=1e-6)
 
 
-def test_points_in_the_world_are_aligned_alike(small: tuple[Scans, Truth]) -> None:
+def test_points_in_the_world_are_aligned_alike(
+    small: tuple[Scans, Truth], refined: Segmentation
+) -> None:
     scans, _ = small
     assert scans.T_world_view is not None and scans.view is not None
     pose = scans.T_world_view[scans.view]
     world = np.einsum("nij,nj->ni", pose[:, :3, :3], scans.points) + pose[:, :3, 3]
     there = segment(replace(scans, points=world, frame="world"), REFINE).registration
-    here = segment(scans, REFINE).registration
+    here = refined.registration
     assert here is not None and there is not None
     np.testing.assert_allclose(there.refined, here.refined, atol=1e-4)
     bare = segment(replace(scans, points=world, frame="world", T_world_view=None), REFINE)
@@ -116,20 +125,21 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
     assert len(answers) == 1
 
 
-def test_result_files_keep_the_registration(small: tuple[Scans, Truth], tmp_path) -> None:
+def test_result_files_keep_the_registration(
+    small: tuple[Scans, Truth], refined: Segmentation, tmp_path
+) -> None:
     from files.compare import assert_equal
 
     from octoseg_ti import files
     from octoseg_ti.files.recording_read import collect, read_segmentation
 
     scans, truth = small
-    result = segment(scans, REFINE)
-    files.write(tmp_path / "a.npz", result)
-    files.write(tmp_path / "a.mcap", result, scans=scans, truth=truth)
+    files.write(tmp_path / "a.npz", refined)
+    files.write(tmp_path / "a.mcap", refined, scans=scans, truth=truth)
     from octoseg_ti.files import npz
 
     for back in (npz.read_segmentation(tmp_path / "a.npz"), read_segmentation(tmp_path / "a.mcap")):
-        assert_equal(back.registration, result.registration)
+        assert_equal(back.registration, refined.registration)
     contents = collect(tmp_path / "a.mcap", {"/tf"})
     stored = contents.metadata["octoseg.registration"]
     assert json.loads(stored["pairs"]) == [[0, 1], [0, 2], [1, 2]]
@@ -142,10 +152,9 @@ def test_result_files_keep_the_registration(small: tuple[Scans, Truth], tmp_path
     np.testing.assert_array_equal(plain.T_world_view, truth.T_world_view)
 
 
-def test_the_report_says_it(small: tuple[Scans, Truth]) -> None:
+def test_the_report_says_it(small: tuple[Scans, Truth], refined: Segmentation) -> None:
     from octoseg_ti.view.report import sections
 
-    result = segment(small[0], REFINE)
-    found = [one for one in sections(result) if one.title == "Registration"]
+    found = [one for one in sections(refined) if one.title == "Registration"]
     assert len(found) == 1 and [row[0] for row in found[0].rows] == ["0 - 1", "0 - 2", "1 - 2"]
     assert not [one for one in sections(segment(small[0])) if one.title == "Registration"]

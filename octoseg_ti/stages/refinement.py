@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from octoseg_ti.alignment import Registration
+from octoseg_ti.device import runtime
 from octoseg_ti.errors import MissingPackageError
 
 _MOST = 100_000
@@ -40,6 +41,8 @@ _SLIDE = 4.0
 _NEAR = 0.75
 """Farthest partner in the joint steps, in spacings: a farther one lies beyond the rim of the
 overlap, and what is wrong with its normal counts with its distance."""
+_MANY = 20_000
+"""The partners of fewer points are found before threads have started to look for them."""
 _ROUNDS = 25
 _STILL = 2e-5
 """Steps below this end the rounds [mm]."""
@@ -167,7 +170,7 @@ def _smooth_points(points: np.ndarray, normals: np.ndarray) -> _View:
     points, normals = points[known[::step]], normals[known[::step]]
     if len(points) <= _NEIGHBORS:
         return _View(np.empty((0, 3)), np.empty((0, 3)), None, 0.0)
-    distance, near = cKDTree(points).query(points, _NEIGHBORS, workers=-1)
+    distance, near = cKDTree(points).query(points, _NEIGHBORS, workers=_threads(points))
     mean = normals[near].mean(axis=1)
     length = np.sqrt(np.einsum("ij,ij->i", mean, mean))
     # Noise alone shortens the mean by its variance, an edge by far more.
@@ -181,6 +184,11 @@ def _smooth_points(points: np.ndarray, normals: np.ndarray) -> _View:
     points = np.ascontiguousarray(points[smooth])
     normals = mean[smooth] / length[smooth, None]
     return _View(points, normals, cKDTree(points), float(np.median(distance[:, 4])))
+
+
+def _threads(points: np.ndarray) -> int:
+    """Return how many threads look for the neighbours of points."""
+    return runtime.ensure_started().threads if len(points) >= _MANY else 1
 
 
 def _radius(views: list[_View]) -> float:
@@ -203,7 +211,9 @@ def _match(first: _View, second: _View, moves: np.ndarray, reach: float) -> _Mat
     for sign, (a, b), (p, q) in ((1.0, (first, second), (0, 1)), (-1.0, (second, first), (1, 0))):
         change = np.linalg.inv(moves[q]) @ moves[p]
         carried = _carry(change, a.points)
-        distance, partner = b.tree.query(carried, distance_upper_bound=reach, workers=-1)
+        distance, partner = b.tree.query(
+            carried, distance_upper_bound=reach, workers=_threads(carried)
+        )
         here = np.flatnonzero(np.isfinite(distance))
         partner = partner[here]
         n = np.einsum("ij,nj->ni", change[:3, :3], a.normals[here])
