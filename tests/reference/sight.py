@@ -42,13 +42,15 @@ def blocked(
         if way[c] < 0 and start[c] > high[c]:
             enters.append((high[c] - start[c]) / way[c])
     first, last = max(enters), length - clear
+    lower = np.array([low for low, *_ in leaves])
+    upper = lower + np.array([[side] for _, side, *_ in leaves])
     steps = math.ceil(max(0.0, min((last - first) / finest, STEPS)))
     for k in range(steps):
         step = (last - first) / steps
         p = start + (first + (k + 0.5) * step) * way
-        for low, side, mean, normal, held in leaves:
-            inside = np.all((p >= low) & (p < low + side))
-            if inside and abs(float((p - mean) @ normal)) <= step + reach:
+        for c in np.flatnonzero(np.all((p >= lower) & (p < upper), axis=1)):
+            *_, mean, normal, held = leaves[c]
+            if abs(float((p - mean) @ normal)) <= step + reach:
                 down = normals[held] @ way
                 steep = (np.abs(down) > GRAZING) & heavy[held]
                 far = ((points[held] - start) * normals[held]).sum(axis=1)[steep] / down[steep]
