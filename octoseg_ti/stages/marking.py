@@ -15,11 +15,11 @@ _ASIDE = 2.25
 @ti.func
 def _in_leaf(
     point_in: ti.template(), mark_in: ti.template(), leaf_in: ti.template(), box_in: ti.template(),
-    c: ti.i32, i: ti.i32, wanted: ti.i32, square: ti.f64,
+    span_in: ti.template(), c: ti.i32, i: ti.i32, wanted: ti.i32, square: ti.f64,
 ) -> ti.i32:  # fmt: skip
     """Say whether leaf c has a point with the mark that is nearer to point i than the reach."""
     found = 0
-    if leaf_in[c, 2] <= wanted and wanted <= leaf_in[c, 3]:
+    if span_in[c, 0] <= wanted and wanted <= span_in[c, 1]:
         p = row(point_in, i)
         if box_gap(box_in, c, p) < square:
             for j in range(leaf_in[c, 0], leaf_in[c, 0] + leaf_in[c, 1]):
@@ -41,18 +41,31 @@ def _look_for_marked(
     entry_in: I32Rows,
     reach_in: F64Array,
     # Out:
+    span_out: I32Rows,
     found_out: I32Array,
 ):
-    """Look for a marked point in the leaf of every entry and those that touch it."""
+    """Look for a marked point in the leaf of every entry and those that touch it.
+
+    The least and the largest mark of every leaf come first: they tell of most leaves all there is.
+    """
+    for c in range(leaf_in.shape[0]):
+        low = mark_in[leaf_in[c, 0]]
+        high = low
+        for j in range(leaf_in[c, 0] + 1, leaf_in[c, 0] + leaf_in[c, 1]):
+            low = ti.min(low, mark_in[j])
+            high = ti.max(high, mark_in[j])
+        span_out[c, 0] = low
+        span_out[c, 1] = high
     for e in range(entry_in.shape[0]):
         i = entry_in[e, 0]
         c = entry_in[e, 1]
         wanted = entry_in[e, 2]
         square = reach_in[e] * reach_in[e]
-        found = _in_leaf(point_in, mark_in, leaf_in, box_in, c, i, wanted, square)
+        found = _in_leaf(point_in, mark_in, leaf_in, box_in, span_out, c, i, wanted, square)
         k = start_in[c]
         while k < start_in[c + 1] and found == 0:
-            found = _in_leaf(point_in, mark_in, leaf_in, box_in, neighbor_in[k], i, wanted, square)
+            b = neighbor_in[k]
+            found = _in_leaf(point_in, mark_in, leaf_in, box_in, span_out, b, i, wanted, square)
             k += 1
         k = start_in[c]
         # The leaves beyond matter where those that touch are smaller than the reach.
@@ -62,9 +75,8 @@ def _look_for_marked(
             if box_gap(box_in, b, row(point_in, i)) > _ASIDE * square:
                 j = start_in[b + 1]
             while j < start_in[b + 1] and found == 0:
-                found = _in_leaf(
-                    point_in, mark_in, leaf_in, box_in, neighbor_in[j], i, wanted, square
-                )
+                a = neighbor_in[j]
+                found = _in_leaf(point_in, mark_in, leaf_in, box_in, span_out, a, i, wanted, square)
                 j += 1
             k += 1
         found_out[e] = found
@@ -97,20 +109,19 @@ def marked_near(
     entries = len(point)
     if entries == 0:
         return np.zeros(0, bool)
-    marks = mark.astype(np.int32, copy=False)
-    low, high = np.minimum.reduceat(marks, leaves.first), np.maximum.reduceat(marks, leaves.first)
     entry = np.empty((entries, 3), np.int32)
     entry[:, 0], entry[:, 1], entry[:, 2] = point, leaf, wanted
     found = runtime.empty(entries, np.int32)
     _look_for_marked(
         points,
-        runtime.upload(marks),
-        runtime.upload(np.stack([leaves.first, leaves.count, low, high], axis=1)),
+        runtime.upload(mark.astype(np.int32, copy=False)),
+        runtime.upload(np.column_stack([leaves.first, leaves.count])),
         runtime.upload(leaves.box),
         runtime.upload(leaves.start),
         runtime.upload(leaves.neighbor),
         runtime.upload(entry),
         runtime.upload(reach.astype(np.float64)),
+        runtime.empty((len(leaves), 2), np.int32),
         found,
     )
     return runtime.download(found)[:entries] > 0

@@ -53,10 +53,20 @@ class Places(NamedTuple):
     height: np.ndarray
     """Heights above both surfaces, added up [mm]: above 0 = a concave edge."""
 
+    def at(self, entries: np.ndarray) -> "Places":
+        """Return some of the entries."""
+        return Places(*(values[entries] for values in self))
+
     @property
     def turn(self) -> np.ndarray:
         """Angle by which the surface turns from one side of the edge to the other [rad]."""
         return np.arccos(np.clip(self.bend, -1.0, 1.0))
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Tangent of half that angle."""
+        bend = np.clip(self.bend, -1.0, 1.0)
+        return np.sqrt((1.0 - bend) / np.maximum(1.0 + bend, 1e-12))
 
 
 @ti.func
@@ -397,7 +407,7 @@ def points_beside(
     )
     far = runtime.download(along)[: ends[-1]]
     beside = np.flatnonzero(far < np.inf)
-    which = np.searchsorted(ends, beside, side="right")
+    which = np.repeat(np.arange(len(edge)), count)[beside]
     return beside + (first - (ends - count))[which], which, far[beside]
 
 
