@@ -125,11 +125,10 @@ def arrange(scans: Scans) -> Arranged:
     """
     usable = np.ones(len(scans.points), bool)
     for rows in (scans.points, scans.normals):
-        # A sum is finite only if all numbers are; that says it for most inputs at once.
-        with np.errstate(over="ignore", invalid="ignore"):
-            finite = rows is None or np.isfinite(rows.sum())
-        if rows is not None and not finite:
-            usable &= np.isfinite(rows).all(axis=1)
+        if rows is not None:
+            finite = np.isfinite(rows)
+            if not finite.all():  # in rows of three that takes ten times as long
+                usable &= finite.all(axis=1)
     whole = bool(usable.all())
     row = np.arange(len(usable)) if whole else np.flatnonzero(usable)
     _need_three(len(row), len(usable))

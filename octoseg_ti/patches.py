@@ -214,12 +214,12 @@ def assemble(
     labels = in_rows(name.take(found.label), place, NONE)
     labels[left_out] = name[back]
     outlier[left_out[back >= 0]] = 0
-    node = runtime.download(grid.node).take(leaves, axis=0)
+    node, side = runtime.download(grid.node).take(leaves, axis=0), grid.edge_length[leaves]
     mean = runtime.download(grid.mean).take(leaves, axis=0)
     level = node[:, LEVEL].astype(np.int8)
     cells = Cells(
-        corner=grid.corner + node[:, X : Z + 1] * grid.edge_length[leaves, None],
-        size=grid.edge_length[leaves],
+        corner=grid.corner + node[:, X : Z + 1] * side[:, None],
+        size=side,
         level=level,
         count=grid.holds[leaves],
         normal=mean[:, NORMAL : NORMAL + 3].astype(np.float32),
@@ -294,9 +294,7 @@ def _fillets(borders: Borders, place: np.ndarray, name: np.ndarray, rank: np.nda
         concave=(borders.radius[order] > 0.0).astype(np.uint8),
         points=size[order].astype(np.int32),
         strip=number[borders.strip[rank]],
-        point=in_rows(number.take(borders.fillet), place, NONE)
-        if len(size)
-        else np.full(len(place), NONE, np.int32),
+        point=in_rows(number.take(borders.fillet), place, NONE),
     )
 
 

@@ -119,16 +119,16 @@ def look_around(search: Search, zones: Zones) -> Around:
     share = np.diff(start) / np.maximum(np.diff(whole), 1)
     at = search.place(zones.pairs, np.zeros(pairs), point, pair)
     near = np.flatnonzero(at.along <= search.reach(at.spread))
-    point, pair, at = point[near], pair[near], at.at(near)
+    point, pair = point[near], pair[near]
     start = starts_of(pair, pairs)
     total = np.diff(start)
-    height = np.bincount(pair, np.sign(at.height), pairs)
+    height = np.bincount(pair, np.sign(at.height[near]), pairs)
     return Around(
         point=point,
         start=start,
         every=total / np.maximum(share, 1e-9),
         hollow=np.where(height < 0.0, -1.0, 1.0),
-        turn=np.bincount(pair, at.turn, pairs) / np.maximum(total, 1),
+        turn=np.bincount(pair, at.turn[near], pairs) / np.maximum(total, 1),
     )
 
 

@@ -89,7 +89,9 @@ def sort_pairs(key: Any, index: Any | None, bits: int) -> tuple[Any, Any]:
     if n <= _MOST_PACKED and bits + place_bits <= 63 and runtime.on_cpu():
         # With the place in its low bits no key is twice there, so that NumPy's sort, which is not
         # stable but much faster, does.
-        packed = np.sort((key << place_bits) | np.arange(n))
+        packed = key << place_bits
+        packed |= np.arange(n)
+        packed.sort()
         place = packed & ((1 << place_bits) - 1)
         return packed >> place_bits, place.astype(np.int32) if index is None else index.take(place)
     if index is None:

@@ -53,10 +53,6 @@ class Places(NamedTuple):
     height: np.ndarray
     """Heights above both surfaces, added up [mm]: above 0 = a concave edge."""
 
-    def at(self, entries: np.ndarray) -> "Places":
-        """Return some of the entries."""
-        return Places(*(values[entries] for values in self))
-
     @property
     def turn(self) -> np.ndarray:
         """Angle by which the surface turns from one side of the edge to the other [rad]."""

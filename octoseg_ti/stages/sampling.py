@@ -33,8 +33,8 @@ def sample_stripes(start: np.ndarray, count: int = _SAMPLES) -> np.ndarray:
 def ascending(values: np.ndarray) -> np.ndarray:
     """Return the non-negative values in ascending order."""
     values = np.sort(values)  # faster than to pick them first; NaN come last
-    first = np.count_nonzero(values < 0.0)
-    return values[first : first + np.count_nonzero(values >= 0.0)]
+    zero, infinite = values.dtype.type(0), values.dtype.type(np.inf)
+    return values[values.searchsorted(zero) : values.searchsorted(infinite, side="right")]
 
 
 def median(values: np.ndarray) -> float:
