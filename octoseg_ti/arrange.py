@@ -125,11 +125,10 @@ def arrange(scans: Scans) -> Arranged:
     """
     usable = np.ones(len(scans.points), bool)
     for rows in (scans.points, scans.normals):
-        # A sum is finite only if all numbers are; that says it for most inputs at once.
-        with np.errstate(over="ignore", invalid="ignore"):
-            finite = rows is None or np.isfinite(rows.sum())
-        if rows is not None and not finite:
-            usable &= np.isfinite(rows).all(axis=1)
+        if rows is not None:
+            finite = np.isfinite(rows)
+            if not finite.all():  # in rows of three that takes ten times as long
+                usable &= finite.all(axis=1)
     whole = bool(usable.all())
     row = np.arange(len(usable)) if whole else np.flatnonzero(usable)
     _need_three(len(row), len(usable))
@@ -139,23 +138,25 @@ def arrange(scans: Scans) -> Arranged:
     if scans.stripe is None:
         return _arranged(scans, row, view, None, None, whole)
     stripe = scans.stripe if whole else scans.stripe[row]
-    later = stripe[1:] >= stripe[:-1]
-    if scans.view is not None:
-        later = (view[1:] > view[:-1]) | ((view[1:] == view[:-1]) & later)
-    if not later.all():
+    first = _first_of_stripes(view, stripe)
+    key = view[first].astype(np.int64) << 32 | stripe[first]
+    if not (key[1:] > key[:-1]).all():
         whole = False
         order = np.lexsort((stripe, view))  # stable: the order along a stripe is kept
         row, view, stripe = row[order], view[order], stripe[order]
-    new = np.empty(len(row), bool)
-    new[0] = True
-    new[1:] = stripe[1:] != stripe[:-1]
-    if scans.view is not None:
-        new[1:] |= view[1:] != view[:-1]
-    first = np.flatnonzero(new)
+        first = _first_of_stripes(view, stripe)
     _need_two(len(first))
     start = np.append(first, len(row)).astype(np.int32)
     run = np.repeat(np.arange(len(first), dtype=np.int32), np.diff(start))
     return _arranged(scans, row, view, run, start, whole)
+
+
+def _first_of_stripes(view: np.ndarray, stripe: np.ndarray) -> np.ndarray:
+    """Return the rows where another stripe or view begins than that of the row before."""
+    new = np.ones(len(stripe), bool)
+    np.not_equal(stripe[1:], stripe[:-1], out=new[1:])
+    new[1:] |= view[1:] != view[:-1]
+    return np.flatnonzero(new)
 
 
 def probe_positions(

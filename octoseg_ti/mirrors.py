@@ -15,9 +15,9 @@ import numpy as np
 from octoseg_ti.arrange import Arranged
 from octoseg_ti.device import runtime
 from octoseg_ti.patches import Regions
+from octoseg_ti.stages.assignment import runs_of, sizes_of
 from octoseg_ti.stages.grid import Grid
-from octoseg_ti.stages.leaves import members_of
-from octoseg_ti.stages.sets import spread
+from octoseg_ti.stages.leaves import ranges
 from octoseg_ti.stages.sight import blocked_lines
 from octoseg_ti.types import NONE
 
@@ -32,20 +32,17 @@ _CLEAR, _REACH = 1.0, 0.5
 
 
 def without_mirror_images(
-    grid: Grid, leaves: np.ndarray, found: Regions, arranged: Arranged, probe: np.ndarray
+    grid: Grid, found: Regions, arranged: Arranged, probe: np.ndarray
 ) -> Regions:
     """Return the regions without those that are mirror images; their points have no label.
 
     Args:
         grid: The sparse grid.
-        leaves: The nodes that are leaves, in Morton order, shape (C,).
         found: The regions.
         arranged: The points that went into the grid, with their runs.
         probe: Where the probe was at every run [mm], world frame, shape (S, 3); NaN = not known.
     """
-    assert arranged.run is not None
-    order = runtime.download(grid.order)
-    gone = _mirrored(grid, leaves, found, arranged.view.take(order), arranged.run, order, probe)
+    gone = _mirrored(grid, found, arranged, probe)
     if not gone.any():
         return found
     number = np.full(found.count + 1, NONE, np.int32)
@@ -61,19 +58,13 @@ def without_mirror_images(
     )
 
 
-def _mirrored(
-    grid: Grid,
-    leaves: np.ndarray,
-    found: Regions,
-    view: np.ndarray,
-    run: np.ndarray,
-    order: np.ndarray,
-    probe: np.ndarray,
-) -> np.ndarray:
-    """Say of every region whether it is a mirror image, shape (K,), bool; ``view`` is sorted."""
+def _mirrored(grid: Grid, found: Regions, arranged: Arranged, probe: np.ndarray) -> np.ndarray:
+    """Say of every region whether it is a mirror image, shape (K,), bool."""
+    assert arranged.run is not None
     label, regions = found.label, found.count
-    views = int(view.max()) + 1
-    seen = np.bincount((label + 1) * views + view, minlength=(regions + 1) * views)
+    views = int(arranged.view.max()) + 1
+    in_scans = label.take(runtime.download(grid.place))
+    seen = sizes_of((in_scans + 1) * views + arranged.view, (regions + 1) * views)
     seen = seen.reshape(regions + 1, views)[1:]  # what has no region comes first
     size = seen.sum(axis=1)
     # Nothing larger blocks the largest region.
@@ -82,10 +73,8 @@ def _mirrored(
         return asked
     # Of every region a few points, evenly: leaves are small along its rim, and lines of sight there
     # pass close by what hides the rest of the face.
-    inside = np.flatnonzero(np.append(asked, False).take(label))
-    few = [spread(members, _LINES) for members in members_of(label.take(inside), regions)]
-    chosen = inside[np.concatenate(few)]
-    place = probe[run[order[chosen]]]
+    chosen = _some_of(label, np.flatnonzero(asked), size[asked])
+    place = probe[arranged.run[runtime.download(grid.order)[chosen]]]
     known = np.isfinite(place).all(axis=1)
     chosen, place = chosen[known], place[known]
     own = label[chosen]
@@ -103,3 +92,25 @@ def _mirrored(
     lines = np.bincount(own, minlength=regions)
     against = np.bincount(own[blocked], minlength=regions)
     return np.asarray((against >= _FEWEST) & (against >= _SHARE * lines))
+
+
+def _some_of(label: np.ndarray, asked: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return some points of every region that is asked about, evenly: `_LINES` or all that it has.
+
+    Args:
+        label: Region of every sorted point, shape (n,).
+        asked: The regions, ascending, shape (A,).
+        size: How many points these have, shape (A,).
+    """
+    number = np.full(int(label.max()) + 2, NONE)
+    number[asked] = np.arange(len(asked))
+    first, length = runs_of(label)
+    # Their runs, region after region; all their points would be one row in this order.
+    of = number[label[first]]
+    run = np.argsort(of, kind="stable")[np.count_nonzero(of < 0) :]
+    ends = np.cumsum(length[run])
+    few = np.minimum(size, _LINES)
+    k, owner = ranges(np.zeros(len(few), np.int64), few), np.repeat(np.arange(len(few)), few)
+    place = (np.cumsum(size) - size)[owner] + (2 * k + 1) * size[owner] // (2 * few[owner])
+    at = np.searchsorted(ends, place, side="right")
+    return first[run[at]] + place - (ends[at] - length[run[at]])

@@ -21,6 +21,7 @@ from octoseg_ti.stages.assignment import (
     in_rows,
     places_of_rows,
     points_of_leaves,
+    sizes_of,
 )
 from octoseg_ti.stages.bends import split_at_bends
 from octoseg_ti.stages.grid import Grid
@@ -192,12 +193,12 @@ def assemble(
 ) -> Segmentation:
     """Number the patches by size, describe their surfaces, and bring all into the input order."""
     patches, n = found.count, len(scans)
-    place = places_of_rows(grid, arranged.row, n)
+    place = places_of_rows(grid, None if arranged.whole else arranged.row, n)
     outlier = (place < 0).astype(np.uint8)
     left_out = np.flatnonzero(outlier)
     outside = scans_in_world(scans, left_out)
     back = _come_back(outside, grid, found, params)
-    size = np.bincount(found.label + 1, minlength=patches + 1)[1:]
+    size = sizes_of(found.label, patches)
     kind, parameters, covariance, residual, surface = _describe(grid, leaves, found, size, measured)
     rank = np.argsort(-(size + np.bincount(back[back >= 0], minlength=patches)), kind="stable")
     name = np.full(patches + 1, NONE, np.int32)
@@ -213,12 +214,12 @@ def assemble(
     labels = in_rows(name.take(found.label), place, NONE)
     labels[left_out] = name[back]
     outlier[left_out[back >= 0]] = 0
-    node = runtime.download(grid.node).take(leaves, axis=0)
+    node, side = runtime.download(grid.node).take(leaves, axis=0), grid.edge_length[leaves]
     mean = runtime.download(grid.mean).take(leaves, axis=0)
     level = node[:, LEVEL].astype(np.int8)
     cells = Cells(
-        corner=grid.corner + node[:, X : Z + 1] * grid.edge_length[leaves, None],
-        size=grid.edge_length[leaves],
+        corner=grid.corner + node[:, X : Z + 1] * side[:, None],
+        size=side,
         level=level,
         count=grid.holds[leaves],
         normal=mean[:, NORMAL : NORMAL + 3].astype(np.float32),
@@ -228,9 +229,10 @@ def assemble(
         label=name[found.cell_label[leaves]],
         initial_size=grid.size,
     )
-    edge, fillets = points_of_leaves(grid, leaves, found.edge), None
     if borders is not None:
         edge, fillets = borders.edge, _fillets(borders, place, name, rank)
+    else:
+        edge, fillets = points_of_leaves(grid, leaves, found.edge), None
     if found.mirrored is not None:
         outlier[in_rows(found.mirrored, place, False)] = 1
     return Segmentation(
@@ -281,7 +283,7 @@ def _fillets(borders: Borders, place: np.ndarray, name: np.ndarray, rank: np.nda
         name: Patch of every region, shape (K + 1,).
         rank: Region of every patch, shape (K,).
     """
-    size = np.bincount(borders.fillet[borders.fillet >= 0], minlength=len(borders.radius))
+    size = sizes_of(borders.fillet, len(borders.radius))
     order = np.argsort(-size, kind="stable")
     number = np.full(len(size) + 1, NONE, np.int32)
     number[order] = np.arange(len(size), dtype=np.int32)
@@ -314,16 +316,20 @@ def _describe(
     assert found.covariance is not None
     kind[kind == int(SurfaceKind.NONE)] = int(SurfaceKind.FREE_FORM)
     on = np.flatnonzero(found.surface >= 0)
+    if len(on) == 0:
+        return kind, parameters, covariance, residual, surface
     which = found.surface[on]
     kind[on], parameters[on] = found.kind[which], found.parameters[which]
     parameters[on, :3] += grid.corner
     covariance[on] = found.covariance[which]
     surface[on] = which
     surface[found.surface < 0] = len(found.kind) + np.arange(patches - len(on))
-    named = np.append(found.surface, np.int32(NONE)).take(found.label)
-    far = distances_to_surfaces(grid.point, named, found.kind, found.parameters)
+    # By region, also of those without a surface: what is the distance there does not matter.
+    far = distances_to_surfaces(
+        grid.point, found.label, found.kind[found.surface], found.parameters[found.surface]
+    )
     # What has no patch comes first.
-    square = np.bincount(found.label + 1, far**2, patches + 1)[1:]
+    square = np.bincount(found.label + 1, np.square(far, out=far), patches + 1)[1:]
     residual[on] = np.sqrt(square / np.maximum(size, 1))[on]
     return kind, parameters, covariance, residual, surface
 

@@ -112,7 +112,7 @@ def segment(
         )
         probe = probe_positions(scans, arranged, aligned)
         if probe is not None and params.cleaning.enabled:
-            found = without_mirror_images(grid, leaves, found, arranged, probe)
+            found = without_mirror_images(grid, found, arranged, probe)
     with stage("borders"):
         borders = trace_borders(scans, arranged, point, probe, grid, found, measured, params)
         if borders is not None:
@@ -376,7 +376,8 @@ def trace_borders(
     assert params.surfaces.noise is not None
     lines = None
     if arranged.run is not None:
-        lines = scan_lines(scans, arranged, point, runtime.download(grid.order), probe)
+        order, place = runtime.download(grid.order), runtime.download(grid.place)
+        lines = scan_lines(scans, arranged, point, order, place, probe)
     search = Search(
         grid.point,
         grid.normal,

@@ -62,19 +62,18 @@ def find_base(
         return None
     down = _mode(outward)
     mine = _along(outward, down) >= _ALIKE
-    names, of = np.unique(label[mine], return_inverse=True)
-    count = np.bincount(of)
+    count = np.bincount(label[mine])
+    names, of = np.flatnonzero(count), (np.cumsum(count > 0) - 1)[label[mine]]
+    count = count[names]
     place, facing = point[mine], normal[mine]
     if np.count_nonzero(count >= _FEWEST) < _WALLS:
         return None
     # Walls have their rims at other distances from the plane; in its tilt all agree.
-    middle = place.mean(axis=0)
-    one = np.cross(down, np.eye(3)[np.abs(down).argmin()])
-    one /= np.linalg.norm(one)
-    other = np.cross(down, one)
+    off = place - place.mean(axis=0)
+    one, other = _across(down)
     x, y, z = (
         side - (np.bincount(of, side) / count)[of]
-        for side in (_along(place - middle, to) for to in (one, other, down))
+        for side in (_along(off, to) for to in (one, other, down))
     )
     xx, xy, yy, xz, yz = (float((a * b).sum()) for a, b in ((x, x), (x, y), (y, y), (x, z), (y, z)))
     whole = xx * yy - xy * xy
@@ -99,8 +98,8 @@ def find_base(
         # No wall shows the plane itself; it is above the next stripe of each.
         base += 0.5 * max(outer[even].min() + spacing - base, 0.0)
     near &= np.bincount(of, np.abs(_along(facing, down))) / count < _SLOPE
-    lowest = np.where(down > 0.0, box[:, 3:], box[:, :3])
-    goes_on = _along(lowest, down).max() > base + _BELOW * spacing + _NOISES * noise
+    lowest = np.concatenate([np.minimum(down, 0.0), np.maximum(down, 0.0)])
+    goes_on = _along(box, lowest).max() > base + _BELOW * spacing + _NOISES * noise
     if np.count_nonzero(near) < _WALLS or goes_on:
         return None
     return Base(down, float(base), names[near])
@@ -115,9 +114,20 @@ def _along(rows: np.ndarray, to: np.ndarray) -> np.ndarray:
 def _mode(outward: np.ndarray) -> np.ndarray:
     """Return the direction that most of the directions are near."""
     some = outward[:: max(len(outward) // 50, 1)]
-    support = np.count_nonzero(np.einsum("ij,kj->ki", outward, some) >= _ALIKE, axis=1)
+    long = np.ascontiguousarray(outward.T)  # long rows, or the loops over three would take longer
+    support = np.count_nonzero(np.einsum("ji,kj->ki", long, some) >= _ALIKE, axis=1)
     mode = some[int(np.argmax(support))]
     for _ in range(_ROUNDS):
-        mode = outward[_along(outward, mode) >= _ALIKE].mean(axis=0)
+        mode = outward.compress(_along(outward, mode) >= _ALIKE, axis=0).mean(axis=0)
         mode /= np.linalg.norm(mode)
     return mode
+
+
+def _across(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return two unit vectors at right angles to a third and to each other (Duff et al. 2017)."""
+    x, y, z = axis.tolist()
+    sign = 1.0 if z >= 0.0 else -1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    one = [1.0 + sign * x * x * a, sign * b, -sign * x]
+    return np.array(one), np.array([b, sign + y * y * a, -y])

@@ -118,8 +118,7 @@ def look_around(search: Search, zones: Zones) -> Around:
     point, pair = point[kept], pair[kept]
     share = np.diff(start) / np.maximum(np.diff(whole), 1)
     at = search.place(zones.pairs, np.zeros(pairs), point, pair)
-    turn = at.turn
-    near = np.flatnonzero(at.along <= search.reach(turn))
+    near = np.flatnonzero(at.along <= search.reach(at.spread))
     point, pair = point[near], pair[near]
     start = starts_of(pair, pairs)
     total = np.diff(start)
@@ -129,7 +128,7 @@ def look_around(search: Search, zones: Zones) -> Around:
         start=start,
         every=total / np.maximum(share, 1e-9),
         hollow=np.where(height < 0.0, -1.0, 1.0),
-        turn=np.bincount(pair, turn[near], pairs) / np.maximum(total, 1),
+        turn=np.bincount(pair, at.turn[near], pairs) / np.maximum(total, 1),
     )
 
 

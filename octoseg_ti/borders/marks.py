@@ -54,7 +54,7 @@ def mark_points(
     pair, leaf = pair[at], leaf[at]
     near = np.zeros(len(point), bool)
     far = np.where(smooth[pair], reach - 0.5 * search.spacing, along + reach)
-    other = zones.pairs[:, 0][pair] + zones.pairs[:, 1][pair] - search.label[point]
+    other = zones.pairs.sum(axis=1)[pair] - search.label[point]
     for k, marks, wanted in (
         (np.flatnonzero(~chosen[pair]), search.label, other),
         (np.flatnonzero(chosen[pair]), search.claim, pair),

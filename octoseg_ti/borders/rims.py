@@ -44,6 +44,7 @@ def scan_lines(
     arranged: Arranged,
     point: np.ndarray,
     order: np.ndarray,
+    place: np.ndarray,
     probe: np.ndarray | None,
 ) -> Lines:
     """Return the points in scan order, with the ray that saw each.
@@ -53,6 +54,7 @@ def scan_lines(
         arranged: Its usable points, on stripes.
         point: Their positions in the world [mm], shape (n, 3), f64.
         order: Place in scan order of every sorted point, shape (n,).
+        place: The sorted point that every point is, shape (n,).
         probe: Where the probe was at every run [mm], world frame, shape (S, 3); None = not known.
     """
     start, run = arranged.start, arranged.run
@@ -66,7 +68,8 @@ def scan_lines(
         source = None
     views = int(view.max(initial=0)) + 1
     if scans.column is not None:
-        lane = scans.column[arranged.row].astype(np.float64)
+        column = scans.column if arranged.whole else scans.column.take(arranged.row)
+        lane = column.astype(np.float64)
     else:
         axis = stripe_axes(point, start, view[run], views)[view[run]]
         away = point if source is None else point - source[run]
@@ -78,7 +81,7 @@ def scan_lines(
     rise = np.bincount(view, lane[last] - lane[first], views)
     if (rise < 0.0).any():
         lane *= np.where(rise < 0.0, -1.0, 1.0)[view][run]
-    return Lines(point, start, run, view, lane, source, order)
+    return Lines(point, start, run, view, lane, source, order, place)
 
 
 def mark_rims(search: Search, lines: Lines, edge: np.ndarray) -> None:
@@ -89,9 +92,10 @@ def mark_rims(search: Search, lines: Lines, edge: np.ndarray) -> None:
     leaf = search.leaf_of(point)
     place = search.points[point]
     base = find_base(place, normal, outward, label[point], search.leaves.box, spacing, search.noise)
-    stands = np.zeros(len(point), bool)
+    wall = np.zeros(search.count, bool)
     if base is not None:
-        stands = np.isin(label[point], base.walls)
+        wall[base.walls] = True
+    stands = wall[label[point]]
     near = around.near(label, point[~stands], leaf[~stands], (EDGE - _INSIDE) * spacing)
     if base is not None:
         low = np.flatnonzero(around.near(label, point[stands], leaf[stands], EDGE * spacing))
@@ -112,12 +116,11 @@ def find_rims(
     """
     label, spacing = search.label, search.spacing
     # Points at no edge yet: 2 on an analytic surface, 1 elsewhere.
-    state = np.append(np.where(search.analytic, 2, 1), 1).astype(np.uint8)[label]
-    state[edge != int(EdgeClass.NONE)] = 0
-    in_order = np.empty_like(state)
-    in_order[lines.order] = state
-    side = open_sides(lines, in_order == 2, _GAP * spacing)[lines.order]
-    point = np.flatnonzero(side > 0)
+    state = np.append(np.where(search.analytic, 2, 1), 1).astype(np.uint8).take(label)
+    state *= edge == int(EdgeClass.NONE)
+    in_order = state.take(lines.place)
+    side = open_sides(lines, in_order == 2, _GAP * spacing)
+    point = np.sort(lines.place[np.flatnonzero(side > 0)])
     outward, free = around.free_sectors(
         search.device[1], point, search.leaf_of(point), _AROUND * spacing
     )
@@ -127,7 +130,7 @@ def find_rims(
     normal = normals_of(search, point, search.points[point])
     place = lines.order[point]
     found = look_beyond(
-        lines, field, place, side[point], normal, outward,
+        lines, field, place, side[place], normal, outward,
         gap=_GAP * spacing, off=_OFF * spacing + CAP * search.noise,
     )  # fmt: skip
     real = (found & (ENDED | BEHIND)) > 0
@@ -167,7 +170,8 @@ def normals_of(search: Search, point: np.ndarray, place: np.ndarray) -> np.ndarr
     """Return the normals of the surfaces of some points, at other places, shape (E, 3)."""
     label = search.label[point]
     _, normal = evaluate_surfaces(place, label, search.table[:, 8], search.table[:, :8])
-    outward: np.ndarray = np.nan_to_num(normal) * search.table[label, 9:]
+    normal[np.isnan(normal)] = 0.0
+    outward: np.ndarray = normal * search.table[label, 9:]
     return outward
 
 
@@ -178,10 +182,10 @@ def ends_straight(
 
     A face that does may end because the probe sees it too flat from the side.
     """
-    at = search.points[point]
-    turn = [
-        np.linalg.norm(normals_of(search, point, at + way * to) - normal, axis=1)
-        for to in (outward, np.cross(outward, normal))
-    ]
-    straight: np.ndarray = turn[0] <= _STRAIGHT * turn[1] + 1e-9
+    (x, y, z), (a, b, c) = outward.T, normal.T
+    aside = np.column_stack([y * c - z * b, z * a - x * c, x * b - y * a])
+    at = np.concatenate([search.points[point] + way * to for to in (outward, aside)])
+    change = normals_of(search, np.tile(point, 2), at) - np.tile(normal, (2, 1))
+    on, across = np.split(np.sqrt(np.square(change).sum(axis=1)), 2)
+    straight: np.ndarray = on <= _STRAIGHT * across + 1e-9
     return straight

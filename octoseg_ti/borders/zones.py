@@ -35,6 +35,7 @@ _LOCAL, _BETWEEN, _MOSTLY = 8, 0.3, 0.5
 # Radii that are tried: from the least [spacings] up to so many limits.
 _LEAST, _MOST = 1.0, 1.35
 _RATIO = 1.3  # each larger by this ratio: a strip is only to be recognised
+_WIDE = 3.0  # a fillet reaches no farther from its edge than so many radii
 _COARSE = 0.4  # while radii are tried, distances beyond so many spacings count as this many
 
 
@@ -142,8 +143,8 @@ class Search:
     @cached_property
     def balls(self) -> tuple[np.ndarray, np.ndarray]:
         """Centre and radius of a ball around the points of every leaf, shape (C, 3) and (C,)."""
-        low, high = self.leaves.box[:, :3], self.leaves.box[:, 3:]
-        return 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
+        low, high = np.split(np.ascontiguousarray(self.leaves.box.T), 2)
+        return 0.5 * (low + high).T, 0.5 * np.sqrt(np.square(high - low).sum(axis=0))
 
     def leaf_of(self, point: np.ndarray) -> np.ndarray:
         """Return the leaves that hold some points, shape (E,)."""
@@ -188,10 +189,13 @@ class Search:
         """Sum up how profiles fit."""
         return sums(self.device[0], self.table, task, shape, entry, cap, limit)
 
-    def reach(self, turn: np.ndarray) -> np.ndarray:
-        """Return how far from the sharp edge a fillet can reach [mm]."""
-        wide = np.minimum(np.tan(turn / 2.0), 3.0)
-        return _MOST * self.limit * wide + EDGE * self.spacing
+    def reach(self, wide: np.ndarray | float = np.inf) -> Any:
+        """Return how far from the sharp edge a fillet can reach [mm].
+
+        Args:
+            wide: Tangent of half the angle by which it turns; by default any.
+        """
+        return _MOST * self.limit * np.minimum(wide, _WIDE) + EDGE * self.spacing
 
     def absorbed(self) -> float:
         """Return how wide a piece of a fillet may pass as a part of the surface beside it [mm]."""
@@ -245,7 +249,9 @@ class Search:
 
 def _shapes(radii: np.ndarray, hollow: np.ndarray) -> np.ndarray:
     """Return all radii for every task, each with the sign of that, as `profiles.sums` takes it."""
-    return np.stack(np.broadcast_arrays(radii, hollow[:, None]), axis=2)
+    shapes = np.empty((len(hollow), len(radii), 2))
+    shapes[..., 0], shapes[..., 1] = radii, hollow[:, None]
+    return shapes
 
 
 def listed(sets: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -277,9 +283,10 @@ def thinned(start: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     total = np.diff(start)
     step = np.maximum(-(-total // most), 1)
     count = -(-total // step)
-    rank = ranges(np.zeros(len(count), np.int64), count)
-    kept = np.repeat(start[:-1], count) + np.repeat(step, count) * rank
-    return kept, np.append(0, np.cumsum(count))
+    ends = np.append(0, np.cumsum(count))
+    kept = np.repeat(start[:-1] - step * ends[:-1], count)
+    kept += np.repeat(step, count) * np.arange(ends[-1])
+    return kept, ends
 
 
 def pairs_near(near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -319,7 +326,7 @@ def strips_between(search: Search, touching: np.ndarray) -> np.ndarray:
     each = np.diff(start)[triple[:, 0]]
     entry, owner = sample[ranges(start[triple[:, 0]], each)], np.repeat(np.arange(len(each)), each)
     at = search.place(triple[:, 1:], np.zeros(len(triple)), entry, owner)
-    inside = at.along <= search.reach(at.turn)
+    inside = at.along <= search.reach(at.spread)
     height = np.bincount(owner, inside * np.sign(at.height), len(triple))
     fewest = np.minimum(_LOCAL, _BETWEEN * search.size[triple[:, 0]])
     kept = np.bincount(owner, inside, len(triple)) >= fewest
@@ -394,7 +401,7 @@ def leaves_between(search: Search, triple: np.ndarray) -> tuple[np.ndarray, np.n
     # How far fillets reach at most: the nearer ones are picked where points are placed.
     near = search.near_edge(
         triple[:, 1:], np.zeros(len(triple)), middle, leaf, owner,
-        search.reach(np.full(1, np.pi)) + wide[leaf],
+        search.reach() + wide[leaf],
     )  # fmt: skip
     return owner[near], leaf[near]
 

@@ -43,7 +43,6 @@ def _code(
     point_in: F64Rows,
     # Out:
     key_out: I64Array,
-    index_out: I32Array,
 ):
     """Write the Morton key of the finest box that holds each point (x highest)."""
     for i in key_out:
@@ -53,11 +52,10 @@ def _code(
             at = ti.max(0, ti.min(last_in[k], at))
             key = key | (_spread(ti.cast(at, ti.i64)) << (2 - k))
         key_out[i] = key
-        index_out[i] = i
 
 
-def morton_keys(points: Any, corner: np.ndarray, scale: float, last: np.ndarray) -> tuple[Any, Any]:
-    """Return the Morton key of the box of every point, and the index 0..n-1.
+def morton_keys(points: Any, corner: np.ndarray, scale: float, last: np.ndarray) -> Any:
+    """Return the Morton key of the box of every point.
 
     Args:
         points: Positions [mm], shape (n, 3), f64, a kernel array.
@@ -66,7 +64,7 @@ def morton_keys(points: Any, corner: np.ndarray, scale: float, last: np.ndarray)
         last: Largest box coordinate of each axis, shape (3,): points beyond are put there.
 
     Returns:
-        Keys, shape (n,), i64, and indices, shape (n,), i32, kernel arrays.
+        Keys, shape (n,), i64, a kernel array.
 
     Raises:
         ValueError: A coordinate needs more than 21 bits.
@@ -74,14 +72,12 @@ def morton_keys(points: Any, corner: np.ndarray, scale: float, last: np.ndarray)
     runtime.ensure_started()
     if int(np.max(last)) >= 1 << AXIS_BITS:
         raise ValueError(f"a Morton key holds {AXIS_BITS} bits an axis, not {int(np.max(last))}")
-    n = points.shape[0]
-    key, index = runtime.empty(n, np.int64), runtime.empty(n, np.int32)
+    key = runtime.empty(points.shape[0], np.int64)
     _code(
         scale,
         runtime.upload(np.asarray(corner, np.float64)),
         runtime.upload(np.asarray(last, np.int32)),
         points,
         key,
-        index,
     )
-    return key, index
+    return key

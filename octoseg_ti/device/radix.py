@@ -62,12 +62,13 @@ def _sort_by_digit(
                 index_out[place] = index_in[i]
 
 
-def sort_pairs(key: Any, index: Any, bits: int) -> tuple[Any, Any]:
+def sort_pairs(key: Any, index: Any | None, bits: int) -> tuple[Any, Any]:
     """Sort keys, and an index with them, by the lowest bits; equal keys keep their order.
 
     Args:
         key: Non-negative keys, shape (n,), i64, a kernel array. Used as scratch.
-        index: What travels with the keys, shape (n,), i32, a kernel array. Used as scratch.
+        index: What travels with the keys, shape (n,), i32, a kernel array. Used as scratch. None =
+            their places 0..n-1.
         bits: Number of low bits that can differ, 1..63.
 
     Returns:
@@ -80,16 +81,21 @@ def sort_pairs(key: Any, index: Any, bits: int) -> tuple[Any, Any]:
     n = key.shape[0]
     if not 1 <= bits <= 63:
         raise ValueError(f"bits must be 1..63, not {bits}")
-    if index.shape[0] != n:
+    if index is not None and index.shape[0] != n:
         raise ValueError(f"key and index differ in length: {n} and {index.shape[0]}")
     if n == 0:
-        return key, index
+        return key, runtime.upload(np.zeros(0, np.int32))
     place_bits = (n - 1).bit_length()
     if n <= _MOST_PACKED and bits + place_bits <= 63 and runtime.on_cpu():
         # With the place in its low bits no key is twice there, so that NumPy's sort, which is not
         # stable but much faster, does.
-        order = np.sort((key << place_bits) | np.arange(n)) & ((1 << place_bits) - 1)
-        return key.take(order), index.take(order)
+        packed = key << place_bits
+        packed |= np.arange(n)
+        packed.sort()
+        place = packed & ((1 << place_bits) - 1)
+        return packed >> place_bits, place.astype(np.int32) if index is None else index.take(place)
+    if index is None:
+        index = runtime.upload(np.arange(n, dtype=np.int32))
     passes = -(-bits // _MOST_DIGIT_BITS)
     digit_bits = -(-bits // passes)
     workers, stride = runtime.workers()

@@ -142,17 +142,21 @@ def _join(
                 lo = hi
 
 
-def places_of_rows(grid: Grid, row: np.ndarray, rows: int) -> np.ndarray:
+def places_of_rows(grid: Grid, row: np.ndarray | None, rows: int) -> np.ndarray:
     """Return the sorted point of every row of the input, -1 for rows of no point; shape (N,).
 
     Args:
         grid: The sparse grid.
-        row: Input row of every one of its points, as they were given, shape (n,).
+        row: Input row of every one of its points, as they were given, shape (n,); None = all rows
+            in their order.
         rows: Number of rows N.
     """
-    place = np.full(rows, NONE, np.intp)
-    place[row.take(runtime.download(grid.order))] = np.arange(len(row))
-    return place
+    place: np.ndarray = runtime.download(grid.place).astype(np.intp)
+    if row is None:
+        return place
+    of_row = np.full(rows, NONE, np.intp)
+    of_row[row] = place
+    return of_row
 
 
 def in_rows(values: np.ndarray, place: np.ndarray, missing: int) -> np.ndarray:
@@ -167,6 +171,25 @@ def in_rows(values: np.ndarray, place: np.ndarray, missing: int) -> np.ndarray:
         A value of every row, shape (N,), of the same type.
     """
     return np.append(values, values.dtype.type(missing)).take(place)
+
+
+def runs_of(label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first point of every run of points with the same label, and how many it has."""
+    new = np.ones(len(label), bool)
+    np.not_equal(label[1:], label[:-1], out=new[1:])
+    first = np.flatnonzero(new)
+    return first, np.diff(first, append=len(label))
+
+
+def sizes_of(label: np.ndarray, count: int) -> np.ndarray:
+    """Return how many points have each of the labels 0..count-1, -1 = none; shape (count,), i64.
+
+    Neighbours mostly have the same one: their runs are counted, faster than `numpy.bincount` does.
+    """
+    if count == 0:
+        return np.zeros(0, np.int64)
+    first, length = runs_of(label)
+    return np.bincount(label[first] + 1, length, count + 1)[1:].astype(np.int64)
 
 
 def points_of_leaves(grid: Grid, leaves: np.ndarray, values: np.ndarray) -> np.ndarray:

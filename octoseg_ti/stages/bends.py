@@ -10,8 +10,6 @@ gaps of t between them; such a piece has the deviation t / sqrt(12), and its sis
 angle 2 t: a ratio of 0.14.
 """
 
-from itertools import combinations_with_replacement
-
 import numpy as np
 
 from octoseg_ti.device import runtime
@@ -67,19 +65,15 @@ def _flat_faces(
     inside = piece >= 0
     if pieces < 2 or count[inside].sum() < _COVERAGE * count.sum():
         return None
-    tensor = np.zeros((pieces, 3, 3))
-    size = np.bincount(piece[inside], weights=count[inside], minlength=pieces)
-    n = normal[inside]
-    np.add.at(tensor, piece[inside], count[inside, None, None] * n[:, :, None] * n[:, None, :])
-    value, vector = np.linalg.eigh(tensor / size[:, None, None])
+    piece, count, normal = piece[inside], count[inside], normal[inside]
+    size, mean, tensor = _means(piece, count, normal, pieces)
+    value, vector = np.linalg.eigh(tensor)
     axis = vector[:, :, 2]
     # What the noise of one point adds, spread over the points of a typical cell.
-    cells = np.bincount(piece[inside], minlength=pieces)
+    cells = np.bincount(piece, minlength=pieces)
     spread = np.maximum(1.0 - value[:, 2] - noise**2 * cells / size, 0.0)
     if signed:
-        mean = np.zeros((pieces, 3))
-        np.add.at(mean, piece[inside], count[inside, None] * n)
-        axis = axis * np.where(np.einsum("ki,ki->k", axis, mean) < 0, -1.0, 1.0)[:, None]
+        axis = axis * np.where((axis * mean).sum(axis=1) < 0, -1.0, 1.0)[:, None]
         cosine = axis @ axis.T
     else:
         cosine = np.abs(axis @ axis.T)
@@ -293,17 +287,12 @@ def _suspects(
     group: np.ndarray, count: np.ndarray, normal: np.ndarray, min_points: int, flat: float
 ) -> dict[int, np.ndarray]:
     """Return the cells of every group that is large and not flat, by the name of the group."""
-    inside = np.flatnonzero(group >= 0)
-    names, owner = _numbered(group[inside])
-    weight = count[inside].astype(np.float64)
-    nx, ny, nz = np.ascontiguousarray(normal[inside].T)
-    size = np.bincount(owner, weights=weight, minlength=len(names))
+    large = np.bincount(group + 1, weights=count)[1:] >= max(min_points, 1)
+    names, inside = np.flatnonzero(large), np.flatnonzero(np.append(large, False)[group])
+    owner = (np.cumsum(large) - 1)[group[inside]]
     # Axes, not directions: without sides a mean of directions means nothing.
-    tensor = np.empty((len(names), 3, 3))
-    for (i, a), (j, b) in combinations_with_replacement(enumerate((nx, ny, nz)), 2):
-        sums = np.bincount(owner, weights=weight * a * b, minlength=len(names))
-        tensor[:, i, j] = tensor[:, j, i] = sums / size
-    doubtful = (size >= min_points) & (1.0 - np.linalg.eigvalsh(tensor)[:, 2] > flat**2)
+    _, _, tensor = _means(owner, count[inside], normal[inside], len(names))
+    doubtful = 1.0 - np.linalg.eigvalsh(tensor)[:, 2] > flat**2
     asked = np.flatnonzero(doubtful[owner])
     order = asked[np.argsort(owner[asked], kind="stable")]
     ends = np.cumsum(np.bincount(owner[asked], minlength=len(names)))
@@ -311,6 +300,32 @@ def _suspects(
         int(names[g]): inside[order[ends[g - 1] if g else 0 : ends[g]]]
         for g in np.flatnonzero(doubtful)
     }
+
+
+def _means(
+    owner: np.ndarray, count: np.ndarray, normal: np.ndarray, groups: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points, mean normal and mean of its products by itself of every group of cells.
+
+    Args:
+        owner: Group of every cell, 0..groups-1, none without a cell, shape (c,).
+        count: Points of every cell, shape (c,).
+        normal: Mean normal of every cell, shape (c, 3).
+        groups: Number of groups K.
+
+    Returns:
+        Shapes (K,), (K, 3) and (K, 3, 3), f64.
+    """
+    weight = count.astype(np.float64)
+    size = np.bincount(owner, weight, groups)
+    mean, tensor = np.empty((groups, 3)), np.empty((groups, 3, 3))
+    for i, a in enumerate(np.ascontiguousarray(normal.T)):
+        part = weight * a
+        mean[:, i] = np.bincount(owner, part, groups) / size
+        for j in range(i + 1):
+            tensor[:, i, j] = np.bincount(owner, part * normal[:, j], groups) / size
+            tensor[:, j, i] = tensor[:, i, j]
+    return size, mean, tensor
 
 
 def _numbered(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

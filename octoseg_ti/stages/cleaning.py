@@ -75,7 +75,7 @@ def _inspect(
 def _doubtful(code: np.ndarray) -> np.ndarray:
     """Return the rows of kinks and of short pieces, rising, i32."""
     doubt = (code & _KINK) > 0
-    end = np.flatnonzero(code & _BREAK) + 1
+    end = np.flatnonzero(code >= _BREAK) + 1
     begin = np.concatenate([[0], end[:-1]])
     length = end - begin
     short = np.flatnonzero(length < _SHORT)

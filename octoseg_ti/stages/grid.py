@@ -53,6 +53,8 @@ class Grid:
     """Number of nodes; the tables may have more rows."""
     order: Any
     """Index of the points in Morton order, shape (n,), i32."""
+    place: Any
+    """Place in Morton order of every point, shape (n,), i32."""
     point: Any
     """Points in Morton order, relative to ``corner`` [mm], shape (n, 3), f64."""
     normal: Any
@@ -128,11 +130,13 @@ def _gather(
     # Out:
     point_out: F64Rows,
     normal_out: F64Rows,
+    place_out: I32Array,
     head_out: I32Array,
 ):
     """Bring the points into Morton order, and count those that begin an initial cell."""
     for i in order_in:
         j = order_in[i]
+        place_out[j] = i
         for k in ti.static(range(3)):
             point_out[i, k] = point_in[j, k] - corner_in[k]
             normal_out[i, k] = normal_in[j, k]
@@ -372,27 +376,28 @@ def build_grid(
     scale = 2.0**depth / size
     last = np.array([s * 2**depth - 1 for s in shape])
     point = runtime.upload(points)
-    key, index = morton_keys(point, corner, scale, last)
+    key = morton_keys(point, corner, scale, last)
     bits = 3 * ((max(shape) - 1).bit_length() + depth)
-    key, order = radix.sort_pairs(key, index, max(1, bits))
+    key, order = radix.sort_pairs(key, None, max(1, bits))
     sorted_point, sorted_normal = (
         runtime.empty((n, 3), np.float64),
         runtime.empty((n, 3), np.float64),
     )
     workers, stride = runtime.workers()
-    heads = runtime.empty(workers, np.int32)
+    place, heads = runtime.empty(n, np.int32), runtime.empty(workers, np.int32)
     _gather(
         workers, stride, 3 * depth, runtime.upload(corner), key, order, point,
-        runtime.upload(normals), sorted_point, sorted_normal, heads,
+        runtime.upload(normals), sorted_point, sorted_normal, place, heads,
     )  # fmt: skip
     roughness = tolerance if edge_tolerance is None else max(tolerance, edge_tolerance)
     counts = runtime.download(heads)
-    count = int(counts.sum())
-    place = (np.cumsum(counts) - counts).astype(np.int32)
+    ends = np.cumsum(counts, dtype=np.int32)
+    count = int(ends[-1])
     rows = max(2 * count, n // 8)  # a guess, so that the tables seldom have to grow
     node = runtime.empty((rows, 7), np.int32)
     root = runtime.upload(np.full(shape[0] * shape[1] * shape[2], -1, np.int32))
-    _emit_heads(n, workers, stride, 3 * depth, shape, key, runtime.upload(place), node, root)
+    begin = runtime.upload(ends - counts)
+    _emit_heads(n, workers, stride, 3 * depth, shape, key, begin, node, root)
 
     child = runtime.empty((rows, 8), np.int32)
     mean = runtime.empty((rows, 8), np.float64)
@@ -415,13 +420,14 @@ def build_grid(
             key, moment, node, mean, daughters, bound,
         )  # fmt: skip
         counts = runtime.download(daughters)
-        place = (count + np.cumsum(counts) - counts).astype(np.int32)
-        total = count + int(counts.sum())
+        ends = count + np.cumsum(counts, dtype=np.int32)
+        total = int(ends[-1])
         if total > node.shape[0]:
             rows = 2 * total
             node, child, mean = (runtime.grown(a, rows) for a in (node, child, mean))
             moment = runtime.grown(moment, rows, zeros=True)
-        _emit_children(first, count, level, daughters, runtime.upload(place), bound, node, child)
+        begin = runtime.upload(ends - counts)
+        _emit_children(first, count, level, daughters, begin, bound, node, child)
         passes += int(total > count)
         first, count, level = count, total, level + 1
     host = runtime.download(node)[:count]
@@ -429,7 +435,7 @@ def build_grid(
     sizes = size / 2.0 ** np.arange(AXIS_BITS + 1)
     return Grid(
         corner=corner, size=size, shape=shape, depth=depth, signed=signed, count=count, order=order,
-        point=sorted_point, normal=sorted_normal, key=key, root=root, node=node, child=child,
-        mean=mean, moment=moment, passes=passes,
+        place=place, point=sorted_point, normal=sorted_normal, key=key, root=root, node=node,
+        child=child, mean=mean, moment=moment, passes=passes,
         first=lo, holds=host[:, HI] - lo, edge_length=sizes[host[:, LEVEL]],
     )  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 from octoseg_ti.device import runtime
 from octoseg_ti.device.linalg import row
 from octoseg_ti.device.runtime import F32Array, F64Rows, I32Array, ti
-from octoseg_ti.stages.sampling import sample_stripes, trimmed_mean
+from octoseg_ti.stages.sampling import ascending, median, sample_stripes, trimmed_mean
 
 # Mean of the lower three quarters of |x| for x normal, and of a Rayleigh variable, both of unit
 # scale.
@@ -126,12 +126,6 @@ def _measure_noise(
                     tilt_out[s] = ti.cast((middle - middle.dot(normal) * normal).norm(), ti.f32)
 
 
-def _median(values: np.ndarray) -> float:
-    """Return the median of the non-negative values; 0 if there are none."""
-    values = values[values >= 0]
-    return float(np.median(values)) if len(values) else 0.0
-
-
 def stripe_spacing(
     points: np.ndarray, start: np.ndarray, run: np.ndarray, view: np.ndarray
 ) -> tuple[float, float]:
@@ -160,7 +154,7 @@ def stripe_spacing(
         along,
         across,
     )
-    return _median(runtime.download(along)), _median(runtime.download(across))
+    return median(runtime.download(along)), median(runtime.download(across))
 
 
 def stripe_roughness(points: np.ndarray, start: np.ndarray, run: np.ndarray) -> float:
@@ -186,8 +180,7 @@ def stripe_roughness(points: np.ndarray, start: np.ndarray, run: np.ndarray) -> 
         runtime.upload(run),
         off,
     )
-    known = runtime.download(off)
-    known = np.sort(known[known >= 0])
+    known = ascending(runtime.download(off))
     if len(known) == 0:
         return 0.0
     # A quantile, and no mean of what lies below: where positions come in coarse steps, most points

@@ -58,6 +58,12 @@ class Places(NamedTuple):
         """Angle by which the surface turns from one side of the edge to the other [rad]."""
         return np.arccos(np.clip(self.bend, -1.0, 1.0))
 
+    @property
+    def spread(self) -> np.ndarray:
+        """Tangent of half that angle."""
+        bend = np.clip(self.bend, -1.0, 1.0)
+        return np.sqrt((1.0 - bend) / np.maximum(1.0 + bend, 1e-12))
+
 
 @ti.func
 def _side_at(surface_in: ti.template(), s: ti.i32, p: vec3) -> vec4:
@@ -397,7 +403,7 @@ def points_beside(
     )
     far = runtime.download(along)[: ends[-1]]
     beside = np.flatnonzero(far < np.inf)
-    which = np.searchsorted(ends, beside, side="right")
+    which = np.repeat(np.arange(len(edge)), count)[beside]
     return beside + (first - (ends - count))[which], which, far[beside]
 
 

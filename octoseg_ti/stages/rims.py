@@ -49,6 +49,8 @@ class Lines(NamedTuple):
     """Probe at every stripe [mm], shape (S, 3), f64; None = not known."""
     order: np.ndarray
     """Place in scan order of every sorted point, shape (n,)."""
+    place: np.ndarray
+    """The sorted point that every point is, shape (n,)."""
 
 
 @ti.func

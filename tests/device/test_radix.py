@@ -10,9 +10,11 @@ from hypothesis import strategies as st
 from octoseg_ti.device import radix, runtime
 
 
-def sorted_pairs(key: np.ndarray, index: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:
+def sorted_pairs(
+    key: np.ndarray, index: np.ndarray | None, bits: int
+) -> tuple[np.ndarray, np.ndarray]:
     out_key, out_index = radix.sort_pairs(
-        runtime.upload(key.copy()), runtime.upload(index.copy()), bits
+        runtime.upload(key.copy()), None if index is None else runtime.upload(index.copy()), bits
     )
     return runtime.download(out_key)[: len(key)], runtime.download(out_index)[: len(key)]
 
@@ -24,9 +26,11 @@ def check(key: np.ndarray, bits: int, seed: int) -> None:
     for packed in (len(key), 0):  # by NumPy where it can be, and by digits
         with patch.object(radix, "_MOST_PACKED", packed):
             out_key, out_index = sorted_pairs(key, index, bits)
+            _, places = sorted_pairs(key, None, bits)
         what = f"seed {seed}, {bits} bits, {packed} packed"
         np.testing.assert_array_equal(out_key, key[order], err_msg=what)
         np.testing.assert_array_equal(out_index, index[order], err_msg=what)
+        np.testing.assert_array_equal(places, order, err_msg=what)
 
 
 @settings(max_examples=60, deadline=None)

@@ -32,7 +32,8 @@ def lines_of(height: np.ndarray, *, views: int = 1, known: bool = True) -> Lines
     source = np.column_stack([there, np.full(len(there), 15), np.full(len(there), 1e4)])
     return Lines(
         points, start, run.astype(np.int32), (there * views // len(height)).astype(np.int32),
-        lane.astype(float), source.astype(float) if known else None, np.arange(len(points)),
+        lane.astype(float), source.astype(float) if known else None,
+        np.arange(len(points)), np.arange(len(points)),
     )  # fmt: skip
 
 

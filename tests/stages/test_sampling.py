@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from octoseg_ti.stages.sampling import sample_stripes, trimmed_mean
+from octoseg_ti.stages.sampling import ascending, median, sample_stripes, trimmed_mean
 
 
 def test_small_clouds_are_taken_whole() -> None:
@@ -35,6 +35,15 @@ def test_the_order_of_stripes_changes_the_order_of_samples_only() -> None:
 def test_the_largest_quarter_does_not_count(outlier: float) -> None:
     values = np.array([outlier, 1.0, 2.0, 3.0])
     assert trimmed_mean(values) == 2.0
+
+
+@pytest.mark.parametrize("n", range(8))
+def test_medians_are_those_of_numpy(n: int) -> None:
+    rng = np.random.default_rng(n)
+    values = rng.uniform(0.0, 9.0, n).astype(np.float32)
+    mixed = rng.permutation(np.append(values, [-1.0, np.nan]).astype(np.float32))
+    np.testing.assert_array_equal(ascending(mixed), np.sort(values))
+    assert median(mixed) == (float(np.median(values)) if n else 0.0)
 
 
 def test_negative_values_are_no_values() -> None:
