@@ -25,9 +25,9 @@ class ProfileOptions:
 
     octoseg profile scan.mcap
 
-    The first run, which compiles or loads the kernels, is shown apart from the median of the runs
-    after it. Kernels are timed in runs of their own, because that slows the stages down. Reading
-    the file is not part of the times.
+    The first run, which compiles or loads the kernels, is shown apart from the median and the least
+    of the runs after it. Kernels are timed in runs of their own, because that slows the stages
+    down. Reading the file is not part of the times.
     """
 
     input: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
@@ -109,11 +109,12 @@ def vars_of(options: Any) -> dict[str, Any]:
 def describe(profile: Profile, machine: dict[str, Any], name: str) -> str:
     """Return the tables of stages and kernels as text."""
     stages = table(
-        ["stage", "ms", "Mpoints/s", "% of total", "first run ms", "of it compile ms"],
+        ["stage", "ms", "least ms", "Mpoints/s", "% of total", "first run ms", "of it compile ms"],
         [
             [
                 "  " * row["depth"] + row["stage"].split(".")[-1],
                 f"{row['ms']:.2f}",
+                f"{row['min_ms']:.2f}",
                 None if row["mpoints_per_s"] is None else f"{row['mpoints_per_s']:.2f}",
                 f"{row['percent']:.1f}",
                 f"{row['cold_ms']:.1f}",
@@ -124,7 +125,7 @@ def describe(profile: Profile, machine: dict[str, Any], name: str) -> str:
     )
     head = (
         f"{name}: {profile.points} points; {machine['arch']}, {machine['threads']} thread(s); "
-        f"median of {len(profile.runs)} runs"
+        f"median and least of {len(profile.runs)} runs"
     )
     if not profile.kernels:
         return f"{head}\n\n{stages}\n\nthis arch records no times of kernels"
