@@ -11,29 +11,22 @@ from octoseg_ti.device.surfaces import (
     TORUS,
     evaluate_surfaces,
 )
+from octoseg_ti.fitting.starts import across
 
 PARAMETERS = 8
 """Point (3), axis or normal (3), a and b."""
 
-WAYS = {
-    PLANE: (0, 3, 4),
-    CYLINDER: (1, 2, 3, 4, 5),
-    CONE: (0, 1, 2, 3, 4, 5),
-    SPHERE: (0, 1, 2, 5),
-    TORUS: (0, 1, 2, 3, 4, 5, 6),
-}
-"""What a surface of every kind can do, in the order of `ways_of`: its point moves along the axis or
-across it in two directions, its axis turns towards these two, a and b grow. A plane stays the same
-where its point moves within it, a cylinder where that moves along the axis."""
-
-# The parameters that a kind has.
-_HAS = {
-    PLANE: (0, 1, 2, 3, 4, 5),
-    CYLINDER: (0, 1, 2, 3, 4, 5, 6),
-    CONE: (0, 1, 2, 3, 4, 5, 6),
-    SPHERE: (0, 1, 2, 6),
-    TORUS: (0, 1, 2, 3, 4, 5, 6, 7),
-}
+# What a surface of every kind can do, in the order of `ways_of`: its point moves along the axis or
+# across it in two directions, its axis turns towards these two, a and b grow. A plane stays the
+# same where its point moves within it, a cylinder where that moves along the axis.
+_CAN = np.zeros((KINDS, 7), bool)
+_CAN[PLANE, [0, 3, 4]] = True
+_CAN[CYLINDER, 1:6] = True
+_CAN[CONE, 0:6] = True
+_CAN[SPHERE, [0, 1, 2, 5]] = True
+_CAN[TORUS] = True
+# The parameters that a kind has: a point, and what can change.
+_HAS = np.insert(_CAN[:, [3, 3, 3, 5, 6]], 0, np.ones((3, KINDS)), axis=1)
 # What of a column other columns leave is rounding below this share of it: what no point holds gets
 # a large, finite deviation.
 _ROUNDING = 1e-12
@@ -61,51 +54,77 @@ def covariances(
     """
     kind, start = np.asarray(kind, np.int32), np.asarray(start, np.int64)
     count = np.diff(start)
-    owner = np.repeat(np.arange(len(kind), dtype=np.int32), count)
-    far, normal = evaluate_surfaces(points, owner, kind, parameters)
-    change = distance_gradient(points, normal, kind[owner], parameters[owner])
     found = np.full((len(kind), PARAMETERS, PARAMETERS), np.nan)
-    for code in range(KINDS):
-        which = np.flatnonzero((kind == code) & (count > len(WAYS[code])))
-        if len(which) == 0:
-            continue
-        place, there = padded(start, which)
-        ways = ways_of(parameters[which, 3:6])[:, :, WAYS[code]]
-        columns = np.einsum("mni,mik->kmn", change[place], ways) * there
-        root = np.einsum("mik,mkj->mij", ways, np.linalg.inv(_triangles(columns)))
-        square = np.sum((far[place] * there) ** 2, axis=1) / (count[which] - len(WAYS[code]))
-        has = np.isin(np.arange(PARAMETERS), _HAS[code])
-        whole = square[:, None, None] * np.einsum("mik,mjk->mij", root, root)
-        found[which] = np.where(has & has[:, None], whole, np.nan)
+    spare = count - _CAN[kind].sum(axis=1)
+    which = np.flatnonzero(spare > 0)
+    if len(which) == 0:
+        return found
+    far, normal = evaluate_surfaces(points, np.repeat(np.arange(len(kind)), count), kind, parameters)
+    place, there = padded(start, which)
+    kind, parameters = kind[which], parameters[which]
+    frame = frames_of(parameters[:, 3:6])
+    change = distance_changes(points.T.take(place, 1), normal.T.take(place, 1), frame, kind, parameters)
+    change *= _CAN[kind].T[:, :, None] & there
+    root = ways_of(frame, kind) @ np.linalg.inv(_triangles(change))
+    square = np.sum((far[place] * there) ** 2, axis=1) / spare[which]
+    whole = square[:, None, None] * np.einsum("mik,mjk->mij", root, root)
+    has = _HAS[kind]
+    found[which] = np.where(has[:, :, None] & has[:, None, :], whole, np.nan)
     return found
 
 
-def distance_gradient(
-    points: np.ndarray, normal: np.ndarray, kind: np.ndarray, parameters: np.ndarray
-) -> np.ndarray:
-    """Return how the distances of points to surfaces change with the parameters of these.
+def frames_of(axis: np.ndarray) -> np.ndarray:
+    """Return every axis and two directions across it, by rows, shape (M, 3, 3)."""
+    u = across(axis)
+    return np.stack([axis, u, np.cross(axis, u)], axis=1)
+
+
+def ways_of(frame: np.ndarray, kind: np.ndarray) -> np.ndarray:
+    """Return the seven ways in which parameters can change, by columns, shape (M, 8, 7).
 
     Args:
-        points: Positions [mm], shape (S, 3).
-        normal: Outward normal of the surface at the foot of every point, shape (S, 3).
-        kind: `SurfaceKind` of the surface of every point, shape (S,).
-        parameters: Its parameters, shape (S, 8).
+        frame: As `frames_of` returns them, shape (M, 3, 3).
+        kind: `SurfaceKind`, shape (M,); a way in which a kind cannot change is 0.
+    """
+    columns = np.swapaxes(frame, 1, 2)
+    ways = np.zeros((len(kind), PARAMETERS, 7))
+    ways[:, :3, :3], ways[:, 3:6, 3:5] = columns, columns[:, :, 1:]
+    ways[:, 6, 5] = ways[:, 7, 6] = 1.0
+    return ways * _CAN[kind][:, None, :]
+
+
+def distance_changes(
+    points: np.ndarray,
+    normal: np.ndarray,
+    frame: np.ndarray,
+    kind: np.ndarray,
+    parameters: np.ndarray,
+) -> np.ndarray:
+    """Return how the distances of points change as surfaces change in each of seven ways.
+
+    Args:
+        points: Coordinates of the points of every surface [mm], shape (3, M, k).
+        normal: Outward normal of the surface at the foot of every point, shape (3, M, k).
+        frame: As `frames_of` returns them, shape (M, 3, 3).
+        kind: `SurfaceKind`, shape (M,).
+        parameters: As in `Segmentation.parameters`, shape (M, 8).
 
     Returns:
-        Shape (S, 8); for changes of the axis that keep its length, 0 for what a kind has not.
+        Shape (7, M, k), for the ways of `ways_of`; of no meaning where a kind cannot change so.
     """
-    q, axis = points - parameters[:, :3], parameters[:, 3:6]
-    height, slope = np.einsum("si,si->s", q, axis), np.einsum("si,si->s", normal, axis)
-    away = q - height[:, None] * axis
-    rho = np.sqrt(np.einsum("si,si->s", away, away))
-    a = np.where((kind == CYLINDER) | (kind == SPHERE), -1.0, 0.0)
+    z, x, y = np.einsum("imk,mji->jmk", points - parameters.T[:3, :, None], frame)
+    nz, nx, ny = np.einsum("imk,mji->jmk", normal, frame)
+    change = np.full((7, *z.shape), -1.0)
+    for k, n in enumerate((nz, nx, ny)):
+        np.negative(n, out=change[k])
+    change[3], change[4] = nz * x - z * nx, nz * y - z * ny
     cone, ring = kind == CONE, kind == TORUS
-    half = parameters[cone, 6]
+    half = parameters[cone, 6, None]
+    rho = np.sqrt(x * x + y * y)
     # Behind the apex of a cone its angle changes nothing.
-    a[cone] = -np.maximum(rho[cone] * np.sin(half) + height[cone] * np.cos(half), 0.0)
-    a[ring] = -np.einsum("si,si->s", normal, away)[ring] / np.maximum(rho[ring], 1e-300)
-    turned = slope[:, None] * q - height[:, None] * normal
-    return np.column_stack([-normal, turned, a, np.where(ring, -1.0, 0.0)])
+    change[5, cone] = -np.maximum(rho[cone] * np.sin(half) + z[cone] * np.cos(half), 0.0)
+    change[5, ring] = -(nx * x + ny * y)[ring] / np.maximum(rho[ring], 1e-300)
+    return change
 
 
 def padded(start: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -118,21 +137,6 @@ def padded(start: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray
     place = start[which, None] + np.arange((start[which + 1] - start[which]).max())
     there = place < start[which + 1, None]
     return np.where(there, place, 0), there
-
-
-def ways_of(axis: np.ndarray) -> np.ndarray:
-    """Return the seven ways in which parameters can change, by columns, shape (M, 8, 7)."""
-    # Any two directions across the axis: the first is across the coordinate that it has least of.
-    least = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
-    u = np.cross(axis, least)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    v = np.cross(axis, u)
-    ways = np.zeros((len(axis), PARAMETERS, 7))
-    for k, direction in enumerate((axis, u, v)):
-        ways[:, :3, k] = direction
-    ways[:, 3:6, 3], ways[:, 3:6, 4] = u, v
-    ways[:, 6, 5] = ways[:, 7, 6] = 1.0
-    return ways
 
 
 def _triangles(columns: np.ndarray) -> np.ndarray:
@@ -155,7 +159,8 @@ def _triangles(columns: np.ndarray) -> np.ndarray:
         least = _ROUNDING * np.where(whole[k] > 0.0, whole[k], 1.0)
         triangle[:, k, k] = np.maximum(left, least)
         unit = columns[k] / triangle[:, k, k, None]
-        for j in range(k + 1, unknowns):
-            triangle[:, k, j] = np.einsum("mn,mn->m", unit, columns[j])
-            columns[j] -= triangle[:, k, j, None] * unit
+        later = columns[k + 1 :]
+        share = np.einsum("mn,jmn->jm", unit, later)
+        later -= share[:, :, None] * unit
+        triangle[:, k, k + 1 :] = share.T
     return triangle

@@ -108,6 +108,7 @@ def _judge(
 @ti.kernel
 def _count_distances(
     tasks: ti.i32,
+    groups: ti.i32,
     stride: ti.i32,
     # In:
     point_in: F64Rows,
@@ -118,13 +119,14 @@ def _count_distances(
     # Out:
     bin_inout: I32Array,
 ):
-    """Count the points of every group by the logarithm of their distance."""
+    """Count the points of every group by the logarithm of their distance, try after try."""
     for e in range(tasks * stride):
         if e % stride == 0:
             t = e // stride
-            for i in range(start_in[t // KINDS], start_in[t // KINDS + 1]):
+            g = t // KINDS % groups
+            for i in range(start_in[g], start_in[g + 1]):
                 d, _ = surface_in_row(parameters_in, t, t % KINDS, row(point_in, i))
-                ratio = ti.abs(d) / least_in[t // KINDS]
+                ratio = ti.abs(d) / least_in[g]
                 if weight_in[i] > 0.0:
                     k = 0
                     if ratio > 1.0:
@@ -137,31 +139,29 @@ def to_parameters(state: np.ndarray, centre: np.ndarray, extent: np.ndarray) -> 
     """Return states as parameters of surfaces.
 
     Args:
-        state: As of `iterate`, shape (G, KINDS, STATE).
+        state: As of `iterate`, shape (..., G, KINDS, STATE).
         centre: Centre of every group [mm], shape (G, 3).
         extent: Extent of every group [mm], shape (G,).
 
     Returns:
-        As in `Segmentation.parameters`, shape (G, KINDS, 8).
+        As in `Segmentation.parameters`, shape (..., G, KINDS, 8).
     """
-    parameters = np.full((*state.shape[:2], 8), np.nan)
-    e = extent[:, None]
+    parameters = np.full((*state.shape[:-1], 8), np.nan)
     point, axis = state[..., :3].copy(), state[..., 3:6].copy()
     # The line of a cone with its normal away from the axis, and the axis out of the apex.
-    h, s = state[:, CONE, 9], state[:, CONE, 10]
+    h, s = state[..., CONE, 9], state[..., CONE, 10]
     cosine, sine = np.cos(h), np.sin(h)
     side = np.where(cosine < 0.0, -1.0, 1.0)
     sine, s = sine * side, s * side
-    opens = np.where(sine < 0.0, -1.0, 1.0)
-    axis[:, CONE] *= opens[:, None]
+    axis[..., CONE, :] *= np.where(sine < 0.0, -1.0, 1.0)[..., None]
     sine = np.maximum(np.abs(sine), 1e-6)
-    point[:, CONE] -= (s / sine)[:, None] * axis[:, CONE]
-    parameters[..., :3] = centre[:, None, :] + e[..., None] * point
+    point[..., CONE, :] -= (s / sine)[..., None] * axis[..., CONE, :]
+    parameters[..., :3] = centre[:, None, :] + extent[:, None, None] * point
     parameters[..., 3:6] = axis
-    parameters[:, CONE, 6] = np.arctan2(sine, np.abs(cosine))
-    for kind in (CYLINDER, SPHERE, TORUS):
-        parameters[:, kind, 6] = extent * state[:, kind, 9]
-    parameters[:, TORUS, 7] = extent * state[:, TORUS, 10]
+    parameters[..., 6] = extent[:, None] * state[..., 9]
+    parameters[..., CONE, 6] = np.arctan2(sine, np.abs(cosine))
+    parameters[..., PLANE, 6] = np.nan
+    parameters[..., TORUS, 7] = extent * state[..., TORUS, 10]
     return parameters
 
 
@@ -209,13 +209,22 @@ class _Samples:
         self.weight, self.start = runtime.upload(weight), runtime.upload(start)
 
     def spread(self, parameters: np.ndarray, extent: np.ndarray) -> np.ndarray:
-        """Return the median absolute distance as a standard deviation [mm], to a tenth, (G, 5)."""
-        tasks = self.groups * KINDS
+        """Return the median absolute distance as a standard deviation [mm], to a tenth.
+
+        Args:
+            parameters: Of several tries, shape (T, G, 5, 8).
+            extent: Extent of every group [mm], shape (G,).
+
+        Returns:
+            Shape (T, G, 5).
+        """
+        tasks = parameters.size // 8
         bins = runtime.zeros(tasks * _BINS, np.int32)
         least = extent / 2.0 ** (_BINS / 4)
         models = runtime.upload(parameters.reshape(tasks, 8))
         _count_distances(
             tasks,
+            self.groups,
             runtime.workers()[1],
             self.points,
             self.weight,
@@ -224,7 +233,7 @@ class _Samples:
             runtime.upload(least),
             bins,
         )
-        counts = runtime.download(bins)[: tasks * _BINS].reshape(self.groups, KINDS, _BINS)
+        counts = runtime.download(bins)[: tasks * _BINS].reshape(*parameters.shape[:-1], _BINS)
         below = np.cumsum(counts, axis=-1)
         half = np.argmax(2 * below >= below[..., -1:], axis=-1)
         half[~np.isfinite(parameters[..., 0])] = _BINS
@@ -296,8 +305,8 @@ def fit_all(
     for narrowed in range(1, _NARROWED + 1):
         if last:
             break
-        spreads = [samples.spread(to_parameters(s, m.centre, extent), extent) for s in tries]
-        spread = np.maximum(np.min(spreads, axis=0), scale)
+        spreads = samples.spread(to_parameters(tries, m.centre, extent), extent)
+        spread = np.maximum(spreads.min(axis=0), scale)
         last = narrowed == _NARROWED or bool(np.all(spread > _SETTLED * before))
         before = spread
         if last:

@@ -226,26 +226,33 @@ def _solve(matrix: np.ndarray, right: np.ndarray, ridge: float = 1e-12) -> np.nd
     return np.einsum("...ij,...j->...i", vector, part)
 
 
-def _unit(v: np.ndarray) -> np.ndarray:
-    size = np.linalg.norm(v, axis=-1, keepdims=True)
-    return np.divide(v, size, out=np.zeros_like(v), where=size > 0)
+def _size(v: np.ndarray) -> np.ndarray:
+    """Return the lengths of vectors, shape (..., 1)."""
+    size: np.ndarray = np.sqrt(np.sum(v * v, axis=-1, keepdims=True))
+    return size
 
 
 def _limited(v: np.ndarray) -> np.ndarray:
     """Return vectors cut to the longest that is allowed."""
-    size = np.linalg.norm(v, axis=-1, keepdims=True)
-    return v * np.minimum(1.0, _FAR / np.maximum(size, 1e-300))
+    return v * np.minimum(1.0, _FAR / np.maximum(_size(v), 1e-300))
 
 
 def _toward(v: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
     """Return directions of vectors; the other ones where a vector is too short to have any."""
-    return np.where(np.linalg.norm(v, axis=-1, keepdims=True) > 1e-6, _unit(v), otherwise)
+    size = _size(v)
+    return np.where(size > 1e-6, v / np.maximum(size, 1e-6), otherwise)
 
 
 def across(axis: np.ndarray) -> np.ndarray:
-    """Return a unit vector at right angles to each axis, shape (..., 3)."""
-    other = np.where(np.abs(axis[..., :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    return _unit(np.cross(axis, other))
+    """Return a unit vector at right angles to each axis, shape (..., 3); of none, zero."""
+    x, y, z = np.moveaxis(axis, -1, 0)
+    aside = np.abs(x) < 0.6
+    # The axis times the x axis, and where that is near it, times the y axis.
+    v = np.zeros(axis.shape)
+    v[..., 0], v[..., 1] = np.where(aside, 0.0, -z), np.where(aside, z, 0.0)
+    v[..., 2] = np.where(aside, -y, x)
+    size = _size(v)
+    return np.divide(v, size, out=np.zeros_like(v), where=size > 0)
 
 
 def _axes(m: Moments) -> np.ndarray:
@@ -275,9 +282,8 @@ def _spheres(m: Moments) -> tuple[np.ndarray, np.ndarray]:
     Of the two the one with the smaller deviation, to first order (E|q|^2 = 1 by the scale).
     """
     size = np.trace(m.nn, axis1=1, axis2=2)[:, None, None]
-    lines = _solve(size * np.eye(3) - m.nn, m.q - m.nnq, _RIDGE)
-    algebraic = _solve(m.qq, m.wq / 2.0, _RIDGE)
-    centre = _limited(np.stack((lines, algebraic), axis=1))
+    matrix = np.stack((size * np.eye(3) - m.nn, m.qq), axis=1)
+    centre = _limited(_solve(matrix, np.stack((m.q - m.nnq, m.wq / 2.0), axis=1), _RIDGE))
     square = 1.0 + np.sum(centre**2, axis=-1)
     spread = (
         (m.ww - 1.0)[:, None]
@@ -345,8 +351,8 @@ def _circles(
     cc = f[..., 8] - c * c
     # From the normals: t.(q - centre) = 0 with t at right angles to n; and by the points alone.
     tt = f[..., [[11, 10], [10, 9]]] * np.array([[1.0, -1.0], [-1.0, 1.0]])
-    centre = np.stack((_solve(tt, f[..., 12:14], _RIDGE), _solve(cov, cq / 2.0, _RIDGE)), axis=-2)
-    centre = _limited(centre)
+    matrix, right = np.stack((tt, cov), axis=-3), np.stack((f[..., 12:14], cq / 2.0), axis=-2)
+    centre = _limited(_solve(matrix, right, _RIDGE))
     off = centre - mean[..., None, :]
     tube = np.sqrt(np.trace(cov, axis1=-2, axis2=-1)[..., None] + np.sum(off**2, axis=-1))
     spread = (
@@ -390,29 +396,24 @@ def starts(
     axes = _axes(m)
     f = np.nan_to_num(_profile_means(points, normals, weight, start, m, axes))
     middle = np.linalg.norm(axes[..., :3], axis=-1)
-    rows = np.arange(groups)
-
-    def place(kind: int, square: np.ndarray, height: np.ndarray, *shape: np.ndarray) -> None:
-        square = np.nan_to_num(square, nan=np.inf)
-        for which in range(2 if kind in (CONE, TORUS) else 1):
-            best = np.argmin(square, axis=1)
-            found = np.isfinite(square[rows, best]) | (which == 0)
-            axis = axes[rows, best, 3:]
-            chosen = np.zeros((groups, STATE))
-            chosen[:, :3] = axes[rows, best, :3] + height[rows, best, None] * axis
-            chosen[:, 3:6] = axis
-            for k, values in enumerate(shape):
-                chosen[:, 9 + k] = values[rows, best]
-            state[which, found, kind] = chosen[found]
-            alike = np.abs(np.einsum("gdi,gi->gd", axes[..., 3:], axis)) > _OTHER
-            square = np.where(alike, np.inf, square)
-
-    zero = np.zeros(middle.shape)
-    place(CYLINDER, f[..., 3] - f[..., 0] ** 2, zero, f[..., 0] + middle)
-    angle, offset, square = _lines(f, middle)
-    place(CONE, square, zero, angle, offset)
-    ring, height, tube, square = _circles(f, middle)
-    place(TORUS, square, height, np.maximum(ring, _LEAST), tube)
+    every = np.zeros((3, groups, _DIRECTIONS, STATE))
+    square = np.empty((3, groups, _DIRECTIONS))
+    every[..., :6] = axes
+    every[0, ..., 9], square[0] = f[..., 0] + middle, f[..., 3] - f[..., 0] ** 2
+    every[1, ..., 9], every[1, ..., 10], square[1] = _lines(f, middle)
+    ring, height, every[2, ..., 10], square[2] = _circles(f, middle)
+    every[2, ..., 9] = np.maximum(ring, _LEAST)
+    every[2, ..., :3] += height[..., None] * axes[..., 3:]
+    square = np.nan_to_num(square, nan=np.inf)
+    kinds, rows = np.array([[CYLINDER], [CONE], [TORUS]]), np.arange(groups)
+    order = np.arange(3)[:, None]
+    chosen = every[order, rows, np.argmin(square, axis=2)]
+    state[0, rows, kinds] = chosen
+    alike = np.abs(np.einsum("gdi,kgi->kgd", axes[..., 3:], chosen[1:, :, 3:6])) > _OTHER
+    square = np.where(alike, np.inf, square[1:])
+    other = every[order[1:], rows, np.argmin(square, axis=2)]
+    found = np.isfinite(square.min(axis=2, keepdims=True))
+    state[1, rows, kinds[1:]] = np.where(found, other, np.nan)
     state[0, :, SPHERE, :3], state[0, :, SPHERE, 9] = _spheres(m)
     state[0, :, PLANE, 3:6] = np.linalg.eigh(np.nan_to_num(m.qq))[1][:, :, 0]
     return with_directions(state)

@@ -119,7 +119,7 @@ def explain(
         more = more.joined(finer)
     kept: list[int] = []
     for m, (s, there) in enumerate(zip(fitted, on, strict=True)):
-        if likely[s] and not np.any(found[sets[s]] >= 0):
+        if likely[s] and not (len(more) and np.any(found[sets[s]] >= 0)):
             label[sets[s][there]] = len(kept)
             kept.append(m)
     label[found >= 0] = found[found >= 0] + len(kept)

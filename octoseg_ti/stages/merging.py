@@ -81,21 +81,23 @@ def _without_edges(
     """Return the pairs without those that meet at an edge or a step, shape (P, 2)."""
     used = np.unique(touching.pairs)
     width = np.zeros(len(parts))
-    width[used] = [_width(samples.point[parts[m]]) for m in used]
+    width[used] = _widths([samples.point.take(parts[m], axis=0) for m in used])
     bend = noise / np.maximum(width[touching.pairs], 1e-300)
     smooth = (touching.turn <= _TURN * bend.sum(axis=1)) & (touching.step <= _STEP * noise)
     return touching.pairs[smooth]
 
 
-def _width(point: np.ndarray) -> float:
-    """Return how wide a piece of a surface is, where it is longer than wide [mm].
+def _widths(points: list[np.ndarray]) -> np.ndarray:
+    """Return how wide pieces of surfaces are, where they are longer than wide [mm].
 
     Args:
-        point: Points all over it, shape (k, 3).
+        points: Points all over every piece, shapes (k, 3).
     """
-    q = point - point.mean(axis=0)
-    square = np.einsum("ki,kj->ij", q, q) / len(q)
-    return float(np.sqrt(12.0 * max(np.linalg.eigvalsh(square)[1], 0.0)))
+    square = np.empty((len(points), 3, 3))
+    for m, p in enumerate(points):
+        q = p - p.sum(axis=0) / len(p)
+        square[m] = np.einsum("ki,kj->ij", q, q) / len(q)
+    return np.sqrt(12.0 * np.maximum(np.linalg.eigvalsh(square)[:, 1], 0.0))
 
 
 def _residuals(

@@ -140,8 +140,8 @@ def round_between(
     rise = m.dot(planes[1, :3] - planes[0, :3])
     side = m - n.dot(m) * n
     base = planes[0, :3] + side * (rise / side.dot(side))
-    x = np.einsum("ki,i->k", point - base, across)
-    z = np.einsum("ki,i->k", point - base, up)
+    away = point - base
+    x, z = np.einsum("ki,i->k", away, across), np.einsum("ki,i->k", away, up)
     hollow = 1.0 if np.median(x[first]) > np.median(x[second]) else -1.0
     inside = hollow * z - np.abs(x) * (sine / cosine)
     deep = 1.0 / cosine - 1.0

@@ -63,15 +63,16 @@ def surface_noise(
     count = np.diff(begin)
     if len(count) == 0:
         return None
-    owner = np.repeat(np.arange(len(count)), count)
-    index = index[_shuffled(runtime.download(grid.point).take(index, axis=0), owner)]
     point = runtime.download(grid.point).take(index, axis=0)
+    order = _shuffled(point, np.repeat(np.arange(len(count)), count))
+    index, point = index[order], point.take(order, axis=0)
     normal = runtime.download(grid.normal).take(index, axis=0)
-    seen = view[runtime.download(grid.order)[index]]
     rms, bent = _residuals(point, normal, begin)
     # Where a quadric does, quadrics do for the views too; half of the places tell enough.
-    asked = ~bent[owner] & (owner % 2 == 0)
-    within, apart = _by_view(point[asked], normal[asked], seen[asked], owner[asked], rms)
+    asked = np.flatnonzero(~bent[::2]) * 2
+    rows = ranges(begin[asked], count[asked])
+    seen = view[runtime.download(grid.order)[index[rows]]]
+    within, apart = _by_view(point, normal, rows, seen, np.repeat(asked, count[asked]), rms)
     if apart <= _CHANCE * within:
         return _typical(rms), 0.0
     return max(_typical(rms), float(np.hypot(within, apart))), apart
@@ -91,30 +92,39 @@ def _neighborhoods(
         The sorted points of each, one neighbourhood after the other, ascending, shape (S,); and the
         first of these of every neighbourhood, and S at the end, shape (G + 1,).
     """
-    count = np.diff(first, append=len(key))
-    inside = np.flatnonzero(np.repeat(region >= 0, count))
+    after = np.append(first[1:], len(key))
+    count = after - first
+    inside = np.flatnonzero(region >= 0)
     if len(inside) == 0:
         return inside, np.zeros(1, np.int64)
     # Whole boxes: which points of a box come first would depend on the order of the input.
-    begin = np.unique(np.searchsorted(key, key[inside[np.arange(_COUNT) * len(inside) // _COUNT]]))
+    ends = np.cumsum(count[inside])
+    place = np.arange(_COUNT) * ends[-1] // _COUNT
+    leaf = np.searchsorted(ends, place, "right")
+    begin = np.unique(np.searchsorted(key, key[place + after[inside[leaf]] - ends[leaf]]))
     limit = np.searchsorted(key, key[np.minimum(begin + _WINDOW * _POINTS, len(key) - 1)])
-    # The points region after region, those of one region in Morton order.
-    order = np.argsort(region, kind="stable")
-    point = ranges(first[order], count[order])
+    # The leaves region after region, those of one region in Morton order: a neighbourhood takes up
+    # some places in a row, from that of the first point of its box on.
+    order = inside[np.argsort(region[inside], kind="stable")]
     ends = np.cumsum(count[order])
-    place = np.empty(len(order), np.int64)
-    place[order] = ends - count[order]
+    shift = after[order] - ends  # from the place of a point to the point
+    where = np.empty(len(first), np.int64)
+    where[order] = np.arange(len(order))
     leaf = np.searchsorted(first, begin, "right") - 1
-    start = place[leaf] + begin - first[leaf]
+    start = begin - shift[where[leaf]]
     within = ends[np.searchsorted(region[order], region[leaf], "right") - 1]
     farthest = np.minimum(start + _POINTS, within) - 1
-    end = farthest + np.searchsorted(key, key[point[farthest]], "right") - point[farthest]
-    owner = np.repeat(np.arange(len(begin)), end - start)
-    index = point[ranges(start, end - start)]
-    near = index < limit[owner]
-    size = np.bincount(owner[near], minlength=len(begin))
-    kept = np.flatnonzero(near & (size >= _FEWEST)[owner])
-    return index[kept], np.append(0, np.cumsum(size[size >= _FEWEST]))
+    point = farthest + shift[np.searchsorted(ends, farthest, "right")]
+    end = farthest + np.searchsorted(key, key[point], "right") - point
+    # What each has of a leaf.
+    low, high = np.searchsorted(ends, start, "right"), np.searchsorted(ends, end - 1, "right") + 1
+    part, owner = ranges(low, high - low), np.repeat(np.arange(len(begin)), high - low)
+    low = np.maximum(start[owner], (ends - count[order])[part]) + shift[part]
+    high = np.minimum(np.minimum(end[owner], ends[part]) + shift[part], limit[owner])
+    length = np.maximum(high - low, 0)
+    size = np.bincount(owner, length).astype(np.int64)
+    kept = size[owner] >= _FEWEST
+    return ranges(low[kept], length[kept]), np.append(0, np.cumsum(size[size >= _FEWEST]))
 
 
 def _shuffled(point: np.ndarray, group: np.ndarray) -> np.ndarray:
@@ -122,10 +132,13 @@ def _shuffled(point: np.ndarray, group: np.ndarray) -> np.ndarray:
 
     So no sum over them depends on the order of the input. Groups have numbers below 1024.
     """
-    bits = np.ascontiguousarray(point).view(np.uint64)
-    mixed = bits[:, 0] * _MIX[0] + bits[:, 1] * _MIX[1] + bits[:, 2] * _MIX[2]
+    mixed = np.ascontiguousarray(point).view(np.uint64) @ _MIX
     mixed = (mixed ^ (mixed >> np.uint64(32))) * _MIX[0]
-    return np.argsort((group.astype(np.uint64) << np.uint64(54)) | (mixed >> np.uint64(10)))
+    # Places in the last bits: to sort keys is faster than to sort places by them.
+    last = np.uint64((1 << len(point).bit_length()) - 1)
+    key = (group.astype(np.uint64) << np.uint64(54)) | (mixed >> np.uint64(10))
+    key = np.sort((key & ~last) | np.arange(len(point), dtype=np.uint64))
+    return (key & last).astype(np.int64)
 
 
 def _typical(rms: np.ndarray) -> float:
@@ -135,15 +148,21 @@ def _typical(rms: np.ndarray) -> float:
 
 
 def _by_view(
-    point: np.ndarray, normal: np.ndarray, view: np.ndarray, group: np.ndarray, rms: np.ndarray
+    point: np.ndarray,
+    normal: np.ndarray,
+    rows: np.ndarray,
+    view: np.ndarray,
+    group: np.ndarray,
+    rms: np.ndarray,
 ) -> tuple[float, float]:
     """Return how far points scatter about quadrics of their views, and how far views are apart.
 
     Args:
-        point: Points of some groups, one group after the other [mm], shape (S, 3).
+        point: Points [mm], shape (S, 3).
         normal: Their normals, shape (S, 3).
-        view: Their views, shape (S,).
-        group: Their groups, rising, shape (S,).
+        rows: Those of some groups, shape (k,).
+        view: The views of these, shape (k,).
+        group: Their groups, shape (k,).
         rms: What one surface leaves of every group [mm], shape (G,).
 
     Returns:
@@ -152,17 +171,16 @@ def _by_view(
     """
     if len(view) == 0 or np.all(view == view[0]):
         return 0.0, 0.0
-    key = group * (view.max() + 1) + view
-    order = np.argsort(key, kind="stable")
-    piece = np.cumsum(np.diff(key[order], prepend=-1) > 0) - 1
-    count = np.bincount(piece)
-    name = group[order][np.cumsum(count) - count]
+    views = int(view.max()) + 1
+    key = group * views + view
+    count = np.bincount(key, minlength=len(rms) * views).reshape(-1, views)
     large = count >= _FEWEST
-    large &= np.bincount(name[large], minlength=len(rms))[name] > 1
+    large &= np.count_nonzero(large, axis=1)[:, None] > 1
     if np.count_nonzero(large) < 2 * _MEETINGS:
         return 0.0, 0.0
-    rows = order[large[piece]]
-    name, count = name[large], count[large]
+    kept = np.flatnonzero(large.ravel()[key])
+    rows = rows[kept[np.argsort(key[kept], kind="stable")]]
+    name, count = np.nonzero(large)[0], count[large]
     start = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
     square = count * _of_quadrics(fit_quadrics(point[rows], normal[rows], start), count) ** 2
     # In an order that has nothing to do with the numbers of the views.

@@ -12,7 +12,7 @@ from octoseg_ti.fitting.primitives import fit_all
 from octoseg_ti.fitting.quadrics import fit_quadrics
 from octoseg_ti.fitting.selection import choose, plane_does
 from octoseg_ti.stages.leaves import Leaves, Samples, members_of
-from octoseg_ti.types import SurfaceKind
+from octoseg_ti.types import NONE, SurfaceKind
 
 # A surface fits when its residual is below this many noises.
 _FIT = 1.5
@@ -155,7 +155,7 @@ def spread(members: np.ndarray, most: int) -> np.ndarray:
     """Return at most so many members, evenly spaced."""
     if len(members) <= most:
         return members
-    return members[(2 * np.arange(most) + 1) * len(members) // (2 * most)]
+    return members.take(np.arange(1, 2 * most, 2) * len(members) // (2 * most))
 
 
 def sets_of(samples: Samples, leaves: Leaves, group: np.ndarray, least: float) -> list[np.ndarray]:
@@ -167,10 +167,12 @@ def sets_of(samples: Samples, leaves: Leaves, group: np.ndarray, least: float) -
         group: Group of every leaf, -1 = none, shape (C,), i32.
         least: Fewest points.
     """
-    part = group[samples.leaf]
-    there = group >= 0
-    size = np.bincount(group[there], leaves.count[there], minlength=1)
-    return [s for s in members_of(part, len(size)) if len(s) and size[part[s[0]]] >= least]
+    size = np.bincount(group + 1, leaves.count, minlength=2)[1:]
+    # Most groups are small: only the others are numbered.
+    large = np.flatnonzero(size >= least)
+    number = np.full(len(size) + 1, NONE, np.int32)
+    number[large] = np.arange(len(large))
+    return [s for s in members_of(number[group][samples.leaf], len(large)) if len(s)]
 
 
 def rms_of(samples: Samples, label: np.ndarray, surfaces: Surfaces) -> float:

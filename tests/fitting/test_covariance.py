@@ -14,7 +14,8 @@ from reference.covariances import (
 from reference.surfaces import CONE, CYLINDER, PLANE, SPHERE, TORUS, patch_of, placed
 
 from octoseg_ti.device.surfaces import evaluate_surfaces
-from octoseg_ti.fitting.covariance import covariances, distance_gradient
+from octoseg_ti.fitting.covariance import covariances, distance_changes, frames_of
+from octoseg_ti.fitting.covariance import ways_of as all_ways_of
 from octoseg_ti.fitting.primitives import FREEDOM, fit_all
 
 KINDS = range(5)
@@ -47,24 +48,35 @@ def assert_alike(found: np.ndarray, expected: np.ndarray, tolerance: float = 1e-
     np.testing.assert_allclose(found / scale, expected / scale, atol=tolerance)
 
 
+def changes_of(
+    points: np.ndarray, kind: int, parameters: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return how distances to a surface change, shape (N, 7), and its ways, shape (8, 7)."""
+    code, rows = np.array([kind]), parameters[None]
+    _, normal = evaluate_surfaces(points, np.zeros(len(points), np.int32), code, rows)
+    frame = frames_of(rows[:, 3:6])
+    found = distance_changes(points.T[:, None], normal.T[:, None], frame, code, rows)
+    return found[:, 0].T, all_ways_of(frame, code)[0]
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_are_numerical_derivatives(kind: int) -> None:
     for seed in range(3):
         points, _, parameters = measured(kind, seed, 60, 2.5)
-        codes, rows = np.full(60, kind), np.tile(parameters, (60, 1))
-        _, normal = evaluate_surfaces(points, np.zeros(60, np.int32), codes[:1], parameters[None])
-        found = distance_gradient(points, normal, codes, rows) @ ways_of(kind, parameters)
-        np.testing.assert_allclose(found, gradient_of(points, kind, parameters), atol=1e-6)
+        found, ways = changes_of(points, kind, parameters)
+        same = ways.T @ ways_of(kind, parameters)
+        np.testing.assert_allclose(same.T @ same, np.eye(UNKNOWNS[kind]), atol=1e-12)
+        np.testing.assert_allclose(found @ same, gradient_of(points, kind, parameters), atol=1e-6)
 
 
 def test_behind_the_apex_only_its_place_counts() -> None:
     parameters = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 1.0, 0.5, np.nan])
     points = np.array([[1.1, 2.2, -1.0], [1.0, 2.0, 1.0]])
-    _, normal = evaluate_surfaces(points, np.zeros(2, np.int32), np.array([CONE]), parameters[None])
-    change = distance_gradient(points, normal, np.full(2, CONE), np.tile(parameters, (2, 1)))
+    found, ways = changes_of(points, CONE, parameters)
     away = points - parameters[:3]
-    np.testing.assert_allclose(change[:, :3], -away / np.linalg.norm(away, axis=1)[:, None])
-    np.testing.assert_allclose(change[:, 3:], 0.0, atol=1e-12)
+    expected = -away / np.linalg.norm(away, axis=1)[:, None]
+    np.testing.assert_allclose(found[:, :3], expected @ ways[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(found[:, 3:6], 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,5 +1,7 @@
 """Moments against plain means, and starts that are the surface itself where nothing is noisy."""
 
+import itertools
+
 import numpy as np
 import pytest
 from reference.clouds import rotation
@@ -113,8 +115,10 @@ def test_the_spread_is_the_median_distance() -> None:
     parameters = np.full((2, KINDS, 8), np.nan)
     parameters[:] = [0, 0, 0, 0, 0, 1, 3.0, 1.0]
     parameters[:, CONE, 6] = 0.5
-    found = _Samples(points, points, weight, start).spread(parameters, np.full(2, 4.0))
-    for g in range(2):
+    moved = parameters + [0.3, 0.2, 0.5, 0, 0, 0, 0, 0]
+    tries = np.stack([parameters, moved])
+    both = _Samples(points, points, weight, start).spread(tries, np.full(2, 4.0))
+    for (parameters, found), g in itertools.product(zip(tries, both, strict=True), range(2)):
         rows = np.arange(start[g], start[g + 1])
         rows = rows[weight[rows] > 0]
         for kind in range(KINDS):
