@@ -59,11 +59,15 @@ def covariances(
     which = np.flatnonzero(spare > 0)
     if len(which) == 0:
         return found
-    far, normal = evaluate_surfaces(points, np.repeat(np.arange(len(kind)), count), kind, parameters)
+    far, normal = evaluate_surfaces(
+        points, np.repeat(np.arange(len(kind)), count), kind, parameters
+    )
     place, there = padded(start, which)
     kind, parameters = kind[which], parameters[which]
     frame = frames_of(parameters[:, 3:6])
-    change = distance_changes(points.T.take(place, 1), normal.T.take(place, 1), frame, kind, parameters)
+    change = distance_changes(
+        points.T.take(place, 1), normal.T.take(place, 1), frame, kind, parameters
+    )
     change *= _CAN[kind].T[:, :, None] & there
     root = ways_of(frame, kind) @ np.linalg.inv(_triangles(change))
     square = np.sum((far[place] * there) ** 2, axis=1) / spare[which]

@@ -12,7 +12,6 @@ from octoseg_ti.device.surfaces import (
     CYLINDER,
     KINDS,
     PLANE,
-    SPHERE,
     TORUS,
     surface_in_row,
 )

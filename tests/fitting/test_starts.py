@@ -115,7 +115,7 @@ def test_the_spread_is_the_median_distance() -> None:
     parameters = np.full((2, KINDS, 8), np.nan)
     parameters[:] = [0, 0, 0, 0, 0, 1, 3.0, 1.0]
     parameters[:, CONE, 6] = 0.5
-    moved = parameters + [0.3, 0.2, 0.5, 0, 0, 0, 0, 0]
+    moved = parameters + np.array([0.3, 0.2, 0.5, 0, 0, 0, 0, 0])
     tries = np.stack([parameters, moved])
     both = _Samples(points, points, weight, start).spread(tries, np.full(2, 4.0))
     for (parameters, found), g in itertools.product(zip(tries, both, strict=True), range(2)):
