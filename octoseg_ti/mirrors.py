@@ -15,9 +15,9 @@ import numpy as np
 from octoseg_ti.arrange import Arranged
 from octoseg_ti.device import runtime
 from octoseg_ti.patches import Regions
-from octoseg_ti.stages.assignment import runs_of, sizes_of
 from octoseg_ti.stages.grid import Grid
-from octoseg_ti.stages.leaves import ranges
+from octoseg_ti.stages.leaves import members_of, sizes_of
+from octoseg_ti.stages.sets import spread
 from octoseg_ti.stages.sight import blocked_lines
 from octoseg_ti.types import NONE
 
@@ -73,7 +73,9 @@ def _mirrored(grid: Grid, found: Regions, arranged: Arranged, probe: np.ndarray)
         return asked
     # Of every region a few points, evenly: leaves are small along its rim, and lines of sight there
     # pass close by what hides the rest of the face.
-    chosen = _some_of(label, np.flatnonzero(asked), size[asked])
+    inside = np.flatnonzero(np.append(asked, False).take(label))
+    few = [spread(members, _LINES) for members in members_of(label.take(inside), regions)]
+    chosen = inside[np.concatenate(few)]
     place = probe[arranged.run[runtime.download(grid.order)[chosen]]]
     known = np.isfinite(place).all(axis=1)
     chosen, place = chosen[known], place[known]
@@ -92,25 +94,3 @@ def _mirrored(grid: Grid, found: Regions, arranged: Arranged, probe: np.ndarray)
     lines = np.bincount(own, minlength=regions)
     against = np.bincount(own[blocked], minlength=regions)
     return np.asarray((against >= _FEWEST) & (against >= _SHARE * lines))
-
-
-def _some_of(label: np.ndarray, asked: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Return some points of every region that is asked about, evenly: `_LINES` or all that it has.
-
-    Args:
-        label: Region of every sorted point, shape (n,).
-        asked: The regions, ascending, shape (A,).
-        size: How many points these have, shape (A,).
-    """
-    number = np.full(int(label.max()) + 2, NONE)
-    number[asked] = np.arange(len(asked))
-    first, length = runs_of(label)
-    # Their runs, region after region; all their points would be one row in this order.
-    of = number[label[first]]
-    run = np.argsort(of, kind="stable")[np.count_nonzero(of < 0) :]
-    ends = np.cumsum(length[run])
-    few = np.minimum(size, _LINES)
-    k, owner = ranges(np.zeros(len(few), np.int64), few), np.repeat(np.arange(len(few)), few)
-    place = (np.cumsum(size) - size)[owner] + (2 * k + 1) * size[owner] // (2 * few[owner])
-    at = np.searchsorted(ends, place, side="right")
-    return first[run[at]] + place - (ends[at] - length[run[at]])

@@ -43,8 +43,6 @@ Share = Annotated[float, Range(0.0, 1.0)]
 """A part of a whole."""
 Count = Annotated[int, Range(0)]
 """A number of things."""
-Some = Annotated[int, Range(1)]
-"""A number of things that are never none."""
 
 
 @functools.cache
@@ -128,7 +126,7 @@ class RegistrationParams(_Section):
 class GridParams(_Section):
     """The sparse octree of normals (G1-G8)."""
 
-    divisions: Some | None = None
+    divisions: Annotated[int, Range(1)] | None = None
     """Cells along the shortest side of the bounding box; default: the cell is a power of two
     times the smallest cell."""
     tolerance: Share | None = None

@@ -21,12 +21,11 @@ from octoseg_ti.stages.assignment import (
     in_rows,
     places_of_rows,
     points_of_leaves,
-    sizes_of,
 )
 from octoseg_ti.stages.bends import split_at_bends
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import common_label
-from octoseg_ti.stages.leaves import Leaves
+from octoseg_ti.stages.leaves import Leaves, sizes_of
 from octoseg_ti.stages.moments import LEVEL, NORMAL, SIGMA, STOP, X, Z
 from octoseg_ti.stages.planes import fit_planes
 from octoseg_ti.stages.regions import flood_fill, number_groups, strips

@@ -354,7 +354,8 @@ def explain_regions(
     params = derive(replace(params, surfaces=asked), measured)
     # Distances are told in noises: what single precision cannot tell counts as one.
     rounding = 0.5 * float(np.finfo(np.float32).eps) * extent
-    noise = max(params.surfaces.noise or 0.0, rounding)
+    assert params.surfaces.noise is not None
+    noise = max(params.surfaces.noise, rounding)
     params = replace(params, surfaces=replace(params.surfaces, noise=noise))
     return measured, params, fit_surfaces(grid, leaves, found, params)
 

@@ -27,7 +27,14 @@ from octoseg_ti.stages.labelling import (
     own_lists,
     surface_table,
 )
-from octoseg_ti.stages.leaves import Leaves, Samples, joined_samples, members_of, sample_leaves
+from octoseg_ti.stages.leaves import (
+    Leaves,
+    Samples,
+    joined_samples,
+    members_of,
+    sample_leaves,
+    sizes_of,
+)
 from octoseg_ti.stages.merging import cut_out, explained_by_others, merge_surfaces
 from octoseg_ti.stages.refitting import FEWEST, fitted_to_others, refitted
 from octoseg_ti.stages.rounds import hidden_rounds, refitted_rounds
@@ -354,7 +361,7 @@ class _Search:
         its points are nearer to it than to what they would choose next, whichever way that faces.
         """
         label, count = self.label, len(self.surfaces)
-        size = np.bincount(label + 1, minlength=count + 1)[1:]
+        size = sizes_of(label, count)
         small = size < FREE * self.tolerance.points
         here = np.flatnonzero(np.append(small, False)[label])
         if len(here) == 0:

@@ -14,8 +14,8 @@ from octoseg_ti.patches import Regions, relabelled
 from octoseg_ti.stages.extraction import Tolerance
 from octoseg_ti.stages.grid import Grid
 from octoseg_ti.stages.labelling import Labelling, Rule, label_lists, surface_table
-from octoseg_ti.stages.leaves import Leaves, leaf_graph
-from octoseg_ti.stages.pieces import Entries, measure_entries, names_of_points, pieces
+from octoseg_ti.stages.leaves import Leaves, leaf_graph, sizes_of
+from octoseg_ti.stages.pieces import Entries, measure_entries, pieces
 from octoseg_ti.stages.settling import settle
 from octoseg_ti.surface_search import AROUND, EXPLAINED, FREE, NARROW, Surfaced, find_surfaces
 from octoseg_ti.types import NONE
@@ -54,7 +54,7 @@ def fit_surfaces(grid: Grid, leaves: np.ndarray, found: Regions, params: Params)
         limit=params.edges.fillet_radius,
     )  # fmt: skip
     piece, entries = connected_pieces(grid.point, graph, surfaced, params.normals.gap)
-    label, surface = number_pieces(graph, surfaced, entries, piece, least, fewest)
+    label, surface = number_pieces(surfaced, entries, piece, least, fewest)
     label, surface, free = _with_free_forms(label, surface, found, least)
     if len(surface):
         table = surface_table(
@@ -124,16 +124,16 @@ def _with_free_forms(
         Patch of every point, the free forms last; surface of every other patch; and how many free
         forms there are.
     """
-    size = np.bincount(found.label + 1, minlength=found.count + 1)[1:]
-    left = np.bincount(found.label[label < 0] + 1, minlength=found.count + 1)[1:]
+    size = sizes_of(found.label, found.count)
+    left = sizes_of(found.label[label < 0], found.count)
     stays = (2 * left >= size) & (left >= least)
     stay = np.flatnonzero(stays)
     if len(stay) == 0:
         return label, surface, 0
     # Nothing tells a small surface within a free form from a part of it.
-    size = np.bincount(label + 1, minlength=len(surface) + 1)[1:]
+    size = sizes_of(label, len(surface))
     inside = np.append(stays, False)[found.label]
-    within = np.bincount(label[inside] + 1, minlength=len(surface) + 1)[1:]
+    within = sizes_of(label[inside], len(surface))
     kept = (size >= FREE * least) | (2 * within < size)
     number = np.full(len(surface) + 1, NONE, np.int32)
     number[:-1][kept] = np.arange(np.count_nonzero(kept), dtype=np.int32)
@@ -161,17 +161,11 @@ def connected_pieces(
 
 
 def number_pieces(
-    leaves: Leaves,
-    found: Surfaced,
-    entries: Entries,
-    piece: np.ndarray,
-    least: float,
-    fewest: float,
+    found: Surfaced, entries: Entries, piece: np.ndarray, least: float, fewest: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Number the connected pieces of the surfaces by size.
 
     Args:
-        leaves: The leaves.
         found: The surfaces and their points.
         entries: Their points in every leaf (`measure_entries`).
         piece: Piece of every entry of their lists (`pieces`), shape (C, most), i32.
@@ -195,5 +189,5 @@ def number_pieces(
     names = names[np.argsort(-size[names], kind="stable")]
     number = np.full(len(size), NONE, np.int32)
     number[names] = np.arange(len(names), dtype=np.int32)
-    label = names_of_points(leaves, found.own, found.label, number[mine])
+    label = np.append(number[mine], np.int32(NONE)).take(entries.of_point)
     return label, surface[names]

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from octoseg_ti import DataError, Params, evaluate, mirrors, segment
+from octoseg_ti import DataError, Params, evaluate, segment
 from octoseg_ti.params import CleaningParams
-from octoseg_ti.stages.sets import spread
 from octoseg_ti.types import Scans
 from scanner_sim import StripeScanner, View, blocks, plan_views, simulate
 from scanner_sim.scanner import around
@@ -110,16 +109,3 @@ def test_the_block_of_the_paper_as_an_old_probe_sees_it(planned: bool) -> None:
     assert scores.artefacts is not None
     if planned:  # the others see hardly any images
         assert scores.artefacts.classes["spike"][1] > 0.8
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_points_that_speak_for_a_region_are_spread_evenly(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    label = np.repeat(rng.integers(-1, 9, 400), rng.integers(1, 9, 400)).astype(np.int32)
-    label[label == 5] = rng.choice([4, 5], np.count_nonzero(label == 5), p=[0.9, 0.1])  # a few
-    asked = np.array([0, 2, 5, 8])
-    members = [np.flatnonzero(label == region) for region in asked]
-    got = mirrors._some_of(label, asked, np.array([len(m) for m in members]))
-    expected = np.concatenate([spread(m, mirrors._LINES) for m in members])
-    np.testing.assert_array_equal(got, expected, err_msg=f"seed {seed}")
-    assert min(map(len, members)) < mirrors._LINES < len(members[0])

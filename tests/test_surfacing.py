@@ -42,7 +42,7 @@ def numbered(
 ) -> tuple[np.ndarray, np.ndarray]:
     points = runtime.upload(np.zeros((len(found.label), 3)))  # none too far from another
     piece, entries = connected_pieces(points, leaves, found, None)
-    return number_pieces(leaves, found, entries, piece, least, fewest)
+    return number_pieces(found, entries, piece, least, fewest)
 
 
 def plain_numbers(

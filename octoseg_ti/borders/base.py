@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from octoseg_ti.fitting.starts import across
+
 _ALIKE = 0.9  # cosine of the angle between the outward directions of rims of one plane
 _ROUNDS = 4  # after which their mean does not depend on where it began
 _FEWEST = 20  # rim points of a wall
@@ -70,7 +72,8 @@ def find_base(
         return None
     # Walls have their rims at other distances from the plane; in its tilt all agree.
     off = place - place.mean(axis=0)
-    one, other = _across(down)
+    one = across(down)
+    other = np.cross(down, one)
     x, y, z = (
         side - (np.bincount(of, side) / count)[of]
         for side in (_along(off, to) for to in (one, other, down))
@@ -121,13 +124,3 @@ def _mode(outward: np.ndarray) -> np.ndarray:
         mode = outward.compress(_along(outward, mode) >= _ALIKE, axis=0).mean(axis=0)
         mode /= np.linalg.norm(mode)
     return mode
-
-
-def _across(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two unit vectors at right angles to a third and to each other (Duff et al. 2017)."""
-    x, y, z = axis.tolist()
-    sign = 1.0 if z >= 0.0 else -1.0
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    one = [1.0 + sign * x * x * a, sign * b, -sign * x]
-    return np.array(one), np.array([b, sign + y * y * a, -y])

@@ -182,9 +182,8 @@ def ends_straight(
 
     A face that does may end because the probe sees it too flat from the side.
     """
-    (x, y, z), (a, b, c) = outward.T, normal.T
-    aside = np.column_stack([y * c - z * b, z * a - x * c, x * b - y * a])
-    at = np.concatenate([search.points[point] + way * to for to in (outward, aside)])
+    ways = (outward, np.cross(outward, normal))
+    at = np.concatenate([search.points[point] + way * to for to in ways])
     change = normals_of(search, np.tile(point, 2), at) - np.tile(normal, (2, 1))
     on, across = np.split(np.sqrt(np.square(change).sum(axis=1)), 2)
     straight: np.ndarray = on <= _STRAIGHT * across + 1e-9

@@ -2,7 +2,7 @@
 
 Taichi's threads sleep between kernels. Woken for a kernel of a few milliseconds, Linux often puts
 two of them on one processor while another is idle, and the kernel has ended before it moves one
-away: a scan of 92,000 points takes a third longer then. Where there is a thread for every
+away: a scan of 92,000 points takes a quarter longer then. Where there is a thread for every
 processor, which one runs where is therefore fixed. Elsewhere the system knows better.
 """
 

@@ -29,6 +29,8 @@ ARCHS = ("cpu", "cuda", "vulkan", "metal")
 # A loop of fewer than 512 iterations per thread is not shared between the threads of the CPU
 # backend, so coarse loops (one iteration = one chunk) are stretched by this factor.
 _CPU_STRIDE = 512
+# Parts into which coarse loops fall at least: more than most machines have threads.
+_PARTS = 32
 
 # Aliases, because type checkers refuse calls as annotations.
 F32Array: Any = ti.types.ndarray(dtype=ti.f32, ndim=1)
@@ -160,16 +162,17 @@ def workers() -> tuple[int, int]:
     stretched range makes the CPU backend share the items between its threads. The number of workers
     does not depend on the number of threads, so that a chunk is the same everywhere.
     """
-    return (32, _CPU_STRIDE) if on_cpu() else (1024, 1)
+    return (_PARTS, _CPU_STRIDE) if on_cpu() else (1024, 1)
 
 
 def stride_of(items: int) -> int:
-    """Return the stride for a loop over coarse items, however few: threads share some 32 parts.
+    """Return the stride for a loop over coarse items, however few.
 
+    With many items it is small; with few the loop is as long as one over ``_PARTS`` workers.
     A kernel writes ``for u in range(items * stride): if u % stride == 0: item = u // stride``.
     """
-    parts, stride = workers()
-    return max(min(parts, 32) * stride // max(items, 1), 1)
+    _, stride = workers()
+    return max(_PARTS * stride // max(items, 1), 1)
 
 
 def upload(array: np.ndarray) -> Any:

@@ -26,7 +26,7 @@ _CAN[CONE, 0:6] = True
 _CAN[SPHERE, [0, 1, 2, 5]] = True
 _CAN[TORUS] = True
 # The parameters that a kind has: a point, and what can change.
-_HAS = np.insert(_CAN[:, [3, 3, 3, 5, 6]], 0, np.ones((3, KINDS)), axis=1)
+_HAS = np.hstack([np.ones((KINDS, 3), bool), _CAN[:, [3, 3, 3, 5, 6]]])
 # What of a column other columns leave is rounding below this share of it: what no point holds gets
 # a large, finite deviation.
 _ROUNDING = 1e-12

@@ -396,6 +396,8 @@ def starts(
     axes = _axes(m)
     f = np.nan_to_num(_profile_means(points, normals, weight, start, m, axes))
     middle = np.linalg.norm(axes[..., :3], axis=-1)
+    # For every axis a cylinder, a cone and a torus, in this order. The best of each is taken, and
+    # of the latter two also the best with another axis.
     every = np.zeros((3, groups, _DIRECTIONS, STATE))
     square = np.empty((3, groups, _DIRECTIONS))
     every[..., :6] = axes

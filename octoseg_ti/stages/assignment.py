@@ -173,25 +173,6 @@ def in_rows(values: np.ndarray, place: np.ndarray, missing: int) -> np.ndarray:
     return np.append(values, values.dtype.type(missing)).take(place)
 
 
-def runs_of(label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first point of every run of points with the same label, and how many it has."""
-    new = np.ones(len(label), bool)
-    np.not_equal(label[1:], label[:-1], out=new[1:])
-    first = np.flatnonzero(new)
-    return first, np.diff(first, append=len(label))
-
-
-def sizes_of(label: np.ndarray, count: int) -> np.ndarray:
-    """Return how many points have each of the labels 0..count-1, -1 = none; shape (count,), i64.
-
-    Neighbours mostly have the same one: their runs are counted, faster than `numpy.bincount` does.
-    """
-    if count == 0:
-        return np.zeros(0, np.int64)
-    first, length = runs_of(label)
-    return np.bincount(label[first] + 1, length, count + 1)[1:].astype(np.int64)
-
-
 def points_of_leaves(grid: Grid, leaves: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Spread a value of every leaf over its points, in Morton order.
 

@@ -235,8 +235,7 @@ def leaf_labels(leaves: Leaves, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
     count = len(leaves)
     own, common = runtime.empty((count, MOST), np.int32), runtime.empty(count, np.int32)
     if count:
-        ranges = np.stack([leaves.first, leaves.count], axis=1)
-        _list_labels(runtime.upload(label), runtime.upload(ranges), own, common)
+        _list_labels(runtime.upload(label), runtime.upload(leaves.points), own, common)
     return runtime.download(own)[:count], runtime.download(common)[:count]
 
 
@@ -297,7 +296,7 @@ class Labelling:
             runtime.upload(off),
         )
         self._start, self._neighbor = runtime.upload(leaves.start), runtime.upload(leaves.neighbor)
-        self._leaf = runtime.upload(np.stack([leaves.first, leaves.count], axis=1))
+        self._leaf = runtime.upload(leaves.points)
         self._surfaces = np.zeros((0, 10))
         # What every leaf saw the last time.
         self._near = runtime.upload(np.full((len(leaves), MOST), NONE, np.int32))

@@ -50,6 +50,11 @@ class Leaves:
         """Return the number of leaves."""
         return len(self.node)
 
+    @property
+    def points(self) -> np.ndarray:
+        """First point and number of points of every leaf, shape (C, 2), i32, as kernels take it."""
+        return np.stack([self.first, self.count], axis=1)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Samples:
@@ -221,11 +226,11 @@ def sample_leaves(
     taken = np.full(n, -1, np.int32) if label is None else label
     index = runtime.empty((len(leaves), most), np.int32)
     free = runtime.empty(len(leaves), np.int32)
-    table = np.stack([leaves.first, leaves.count], axis=1)
     fine = _FINE * 2.0**grid.depth / grid.size
     scratch = runtime.empty((len(leaves), most), np.int64)
     _pick(
-        most, fine, grid.point, runtime.upload(taken), runtime.upload(table), scratch, index, free
+        most, fine, grid.point, runtime.upload(taken), runtime.upload(leaves.points),
+        scratch, index, free,
     )  # fmt: skip
     picked, there = runtime.download(index), runtime.download(free)
     found = picked >= 0
@@ -278,3 +283,15 @@ def members_of(label: np.ndarray, count: int) -> list[np.ndarray]:
     ends = np.searchsorted(key, np.arange(count + 1, dtype=kind) << bits)
     order = (key & ((1 << bits) - 1)).astype(np.int64)
     return [order[lo:hi] for lo, hi in pairwise(ends)]
+
+
+def sizes_of(label: np.ndarray, count: int) -> np.ndarray:
+    """Return how many points have each of the labels 0..count-1, -1 = none; shape (count,), i64.
+
+    Neighbours mostly have the same one: their runs are counted, faster than `numpy.bincount` does.
+    """
+    if count == 0 or len(label) == 0:
+        return np.zeros(count, np.int64)
+    first = np.append(0, np.flatnonzero(label[1:] != label[:-1]) + 1)
+    length = np.diff(first, append=len(label))
+    return np.bincount(label[first] + 1, length, count + 1)[1:].astype(np.int64)

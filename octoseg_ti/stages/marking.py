@@ -132,7 +132,7 @@ def marked_near(
     _look_for_marked(
         points,
         runtime.upload(mark.astype(np.int32, copy=False)),
-        runtime.upload(np.column_stack([leaves.first, leaves.count])),
+        runtime.upload(leaves.points),
         runtime.upload(leaves.box),
         runtime.upload(leaves.start),
         runtime.upload(leaves.neighbor),

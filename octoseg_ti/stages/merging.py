@@ -3,7 +3,7 @@
 import numpy as np
 
 from octoseg_ti.stages.contacts import Contacts
-from octoseg_ti.stages.leaves import Samples, members_of
+from octoseg_ti.stages.leaves import Samples, members_of, sizes_of
 from octoseg_ti.stages.sets import Surfaces, capped_rms, fit_sets, spread
 
 # Samples of each surface in a common fit.
@@ -140,7 +140,7 @@ def explained_by_others(
     # What is beyond the largest cap leans on nothing.
     here = np.flatnonzero((off[:, 0] < 2.0 * _FORM) & (label >= 0) & (second >= 0))
     mine, other, near = label[here], second[here], off.take(here, axis=0)
-    size = np.bincount(label + 1, minlength=count + 1)[1:]
+    size = sizes_of(label, count)
     alone = size - np.bincount(mine, minlength=count)
     far, deviation = mean_squares(mine, near[:, 0], (_CAP, 2.0 * _FORM), size, alone)
     (turn,) = mean_squares(mine, near[:, 1], (2.0 * _SMOOTH,), size, alone)

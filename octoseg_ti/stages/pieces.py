@@ -25,6 +25,8 @@ class Entries(NamedTuple):
     """How many there are, shape (k,), i32."""
     square: np.ndarray
     """Sum of the squares of how far they are from the surface that would be next, shape (k,)."""
+    of_point: np.ndarray
+    """Entry of every sorted point, -1 = none, shape (n,), i32."""
 
 
 @ti.func
@@ -50,11 +52,13 @@ def _measure_entries(
     box_inout: F64Rows,
     size_inout: I32Array,
     square_inout: I64Array,
+    entry_out: I32Array,
 ):
-    """Add the points of every leaf to its entries."""
+    """Add the points of every leaf to its entries, and write the entry of every point."""
     for c in first_in:
         for i in range(leaf_in[c, 0], leaf_in[c, 0] + leaf_in[c, 1]):
             e = _entry_of(own_in, first_in, c, label_in[i])
+            entry_out[i] = e
             if e >= 0:
                 p = row(point_in, i)
                 for k in ti.static(range(3)):
@@ -63,27 +67,6 @@ def _measure_entries(
                 off = ti.min(ti.cast(off_in[i], ti.f64), cap)
                 size_inout[e] = size_inout[e] + 1
                 square_inout[e] = square_inout[e] + ti.cast(_UNIT * off * off + 0.5, ti.i64)
-
-
-@ti.kernel
-def _name_points(
-    # In:
-    leaf_in: I32Rows,
-    own_in: I32Rows,
-    first_in: I32Array,
-    label_in: I32Array,
-    name_in: I32Array,
-    # Out:
-    name_out: I32Array,
-):
-    """Write the name that the entry of every point has, -1 for points of none."""
-    for c in first_in:
-        for i in range(leaf_in[c, 0], leaf_in[c, 0] + leaf_in[c, 1]):
-            e = _entry_of(own_in, first_in, c, label_in[i])
-            name = NONE
-            if e >= 0:
-                name = name_in[e]
-            name_out[i] = name
 
 
 @ti.func
@@ -174,41 +157,17 @@ def measure_entries(
     count = int(np.count_nonzero(own >= 0))
     box = np.empty((count, 6))
     box[:, :3], box[:, 3:] = np.inf, -np.inf
+    entry = np.full(len(label), NONE, np.int32)
     kept = runtime.upload(box), runtime.zeros(count, np.int32), runtime.zeros(count, np.int64)
     if count:
+        of_point = runtime.upload(entry)
         _measure_entries(
-            cap, _table(leaves), runtime.upload(own), _first_entries(own), runtime.upload(label),
-            points, runtime.upload(off), *kept,
+            cap, runtime.upload(leaves.points), runtime.upload(own), _first_entries(own),
+            runtime.upload(label), points, runtime.upload(off), *kept, of_point,
         )  # fmt: skip
+        entry = runtime.download(of_point)
     box, size, square = (runtime.download(array)[:count] for array in kept)
-    return Entries(box, size, square / _UNIT)
-
-
-def names_of_points(
-    leaves: Leaves, own: np.ndarray, label: np.ndarray, name: np.ndarray
-) -> np.ndarray:
-    """Return the name that the entry of every point has, -1 for points of none; shape (n,), i32.
-
-    Args:
-        leaves: The leaves.
-        own: Surfaces with points in every leaf, ascending, then -1; shape (C, MOST), i32.
-        label: Surface of every sorted point, -1 = none, shape (n,), i32.
-        name: A name for every entry of ``own``, row by row, shape (k,), i32.
-    """
-    runtime.ensure_started()
-    if len(name) == 0:
-        return np.full(len(label), NONE, np.int32)
-    named = runtime.empty(len(label), np.int32)
-    _name_points(
-        _table(leaves), runtime.upload(own), _first_entries(own), runtime.upload(label),
-        runtime.upload(name), named,
-    )  # fmt: skip
-    return runtime.download(named)
-
-
-def _table(leaves: Leaves) -> Any:
-    """Return first point and number of points of every leaf, for kernels."""
-    return runtime.upload(np.stack([leaves.first, leaves.count], axis=1))
+    return Entries(box, size, square / _UNIT, entry)
 
 
 def _first_entries(own: np.ndarray) -> Any:

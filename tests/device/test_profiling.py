@@ -181,7 +181,7 @@ def test_kernels_of_a_real_run(tmp_path, on):
     profile, trace, last = json.loads(done.stdout)
     assert last == 2 * 199_999
     rows = {row["stage"]: row for row in profile["stages"]}
-    assert rows["outer.ramp"]["cold_ms"] > 2 * rows["outer.ramp"]["min_ms"]
+    assert rows["outer.ramp"]["cold_ms"] > 5 * rows["outer.ramp"]["min_ms"]
     kernels = [e for e in trace["traceEvents"] if e.get("cat") == "kernel"]
     if on == "no":
         assert profile["kernels"] == [] and kernels == []

@@ -15,7 +15,6 @@ from octoseg_ti.stages.assignment import (
     in_rows,
     places_of_rows,
     points_of_leaves,
-    sizes_of,
 )
 from octoseg_ti.stages.grid import Grid, build_grid
 from octoseg_ti.stages.moments import HI, LO
@@ -188,12 +187,3 @@ def test_values_reach_the_rows_of_the_input() -> None:
     expected[row] = of_point
     np.testing.assert_array_equal(got, expected)
     assert got.dtype == np.int8 and (place == -1).sum() == 60
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_sizes_are_those_of_numpy(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    label = np.repeat(rng.integers(-1, 5, 80), rng.integers(1, 9, 80)).astype(np.int32)
-    expected = np.bincount(label + 1, minlength=8)[1:]
-    np.testing.assert_array_equal(sizes_of(label, 7), expected, err_msg=f"seed {seed}")
-    assert sizes_of(label, 7).dtype == np.int64

@@ -11,7 +11,7 @@ from reference.labelling import pick
 
 from octoseg_ti.device import runtime
 from octoseg_ti.stages.grid import build_grid
-from octoseg_ti.stages.leaves import joined_samples, sample_leaves
+from octoseg_ti.stages.leaves import joined_samples, sample_leaves, sizes_of
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -82,3 +82,17 @@ def test_joined_samples_are_those_of_both() -> None:
         np.testing.assert_array_equal(second, getattr(other, name))
     assert both.signed == one.signed
     assert not joined_samples(replace(one, signed=False), other).signed
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_sizes_are_those_of_numpy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    label = np.repeat(rng.integers(-1, 5, 80), rng.integers(1, 9, 80)).astype(np.int32)
+    expected = np.bincount(label + 1, minlength=8)[1:]
+    np.testing.assert_array_equal(sizes_of(label, 7), expected, err_msg=f"seed {seed}")
+    assert sizes_of(label, 7).dtype == np.int64
+
+
+def test_no_points_have_no_labels() -> None:
+    assert sizes_of(np.zeros(0, np.int32), 3).tolist() == [0, 0, 0]
+    assert len(sizes_of(np.full(5, -1), 0)) == 0

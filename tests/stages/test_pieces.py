@@ -9,7 +9,7 @@ from reference.leaves import leaves_of
 from octoseg_ti.device import runtime
 from octoseg_ti.stages.labelling import label_lists, own_lists
 from octoseg_ti.stages.leaves import Leaves
-from octoseg_ti.stages.pieces import measure_entries, names_of_points, pieces
+from octoseg_ti.stages.pieces import measure_entries, pieces
 
 
 def random_own(leaves: Leaves, seed: int, count: int) -> np.ndarray:
@@ -58,13 +58,13 @@ def test_points_of_one_piece_are_no_farther_apart_than_the_gap(seed: int, gap: f
     expected = np.array([[*p.min(axis=0), *p.max(axis=0)] for p in points.values()])
     np.testing.assert_array_equal(entries.box, expected)
     assert entries.size.tolist() == [len(p) for p in points.values()]
-    squares = [np.minimum(off[(leaf == c) & (label == s)], 4.0) ** 2 for c, s in points]
-    units = [np.rint(1024.0 * np.float64(v) ** 2).sum() for v in map(np.sqrt, squares)]
-    np.testing.assert_allclose(entries.square, np.array(units) / 1024.0, atol=1e-2)
-    name = rng.integers(0, 99, len(points)).astype(np.int32)
-    of = dict(zip(points, name.tolist(), strict=True))
-    named = [of.get((c, s), -1) for c, s in zip(leaf.tolist(), label.tolist(), strict=True)]
-    assert names_of_points(leaves, own, label, name).tolist() == named
+    capped = np.minimum(off.astype(float), 4.0)
+    units = [np.floor(1024.0 * capped[(leaf == c) & (label == s)] ** 2 + 0.5) for c, s in points]
+    assert entries.square.tolist() == [np.sum(u) / 1024.0 for u in units]
+    entry = {key: e for e, key in enumerate(points)}
+    assert entries.of_point.tolist() == [
+        entry.get((c, s), -1) for c, s in zip(leaf.tolist(), label.tolist(), strict=True)
+    ]
     found = as_lists(pieces(leaves, own, entries.box, gap))
     assert found == meeting.pieces(as_lists(own), pairs_of(leaves), points, gap)
 
@@ -92,7 +92,7 @@ def test_without_surfaces_there_are_no_pieces() -> None:
     assert np.all(pieces(leaves, own, no_boxes(own), 1.0) == -1)
     entries = measure_entries(runtime.zeros((900, 3), float), leaves, own, label, label, 1.0)
     assert len(entries.size) == 0
-    assert np.all(names_of_points(leaves, own, label, np.zeros(0, np.int32)) == -1)
+    assert np.all(entries.of_point == -1)
 
 
 def test_what_a_full_list_leaves_out_is_of_no_entry() -> None:
@@ -105,5 +105,4 @@ def test_what_a_full_list_leaves_out_is_of_no_entry() -> None:
     off = np.ones(40, np.float32)
     entries = measure_entries(runtime.upload(points), leaves, own, label, off, 4.0)
     assert entries.size.tolist() == [2] * len(held) and np.all(entries.square == 2.0)
-    named = names_of_points(leaves, own, label, np.arange(len(held), dtype=np.int32))
-    np.testing.assert_array_equal(named, np.where(np.isin(label, held), label, -1))
+    np.testing.assert_array_equal(entries.of_point, np.where(np.isin(label, held), label, -1))
